@@ -1,0 +1,75 @@
+# `make demo` and `make test` set themselves up; once that is done it costs nothing again.
+SHELL := /bin/bash
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+
+# uv from the PATH, else one of our own in .tools/
+UV := $(or $(shell command -v uv 2>/dev/null),.tools/bin/uv)
+RUN := .venv/bin/
+READY := .venv/.ready
+SOURCES := pyproject.toml CMakeLists.txt .python-version \
+  $(wildcard */CMakeLists.txt */*.cpp */*.h */*/*.cpp */*/*.h)
+DATA ?= ../shared/data/hdr/fisheye_lumilab
+
+.PHONY: help setup demo office test lint bench clean
+
+help:
+	@echo 'make demo    set up, photograph the virtual set, run every stage, print composite and report'
+	@echo 'make office  the same on a real light probe: make office DATA=folder/of/fisheye_lumilab'
+	@echo 'make test    set up and run the tests'
+	@echo 'make bench   run time against error, beside the peers'
+	@echo 'make lint    ruff, mypy and pyright'
+	@echo 'make clean   remove what was built'
+
+setup: $(READY)
+
+# The system's part: a C++ compiler, Embree and oneTBB.
+.venv/.system:
+	@if ! dpkg -s libembree-dev libtbb-dev g++ >/dev/null 2>&1; then \
+	  need='apt-get install -y --no-install-recommends libembree-dev libtbb-dev g++'; \
+	  if [ "$$(id -u)" = 0 ]; then sudo=; \
+	  elif sudo -n true 2>/dev/null; then sudo=sudo; \
+	  else echo "chromeball needs Embree, oneTBB and a C++ compiler; run once: sudo $$need"; exit 1; fi; \
+	  $$sudo apt-get update -qq && $$sudo env DEBIAN_FRONTEND=noninteractive $$need; \
+	fi
+	@mkdir -p .venv && touch $@
+
+.tools/bin/uv:
+	@python3 -m venv .tools 2>/dev/null || { \
+	  if [ "$$(id -u)" = 0 ]; then sudo=; else sudo=sudo; fi; \
+	  $$sudo apt-get update -qq && $$sudo apt-get install -y python3-venv && python3 -m venv --clear .tools; }
+	@.tools/bin/pip install --quiet uv
+
+# Python 3.13: from the PATH or from pyenv's versions folder (its shims may be there and fail),
+# else uv is left to find or fetch one.
+$(READY): $(SOURCES) | .venv/.system $(filter .tools/bin/uv,$(UV))
+	@python=3.13; \
+	for p in python3.13 $${PYENV_ROOT:-$$HOME/.pyenv}/versions/3.13*/bin/python3.13; do \
+	  if $$p -c 'import sys; sys.exit(sys.version_info[:2] != (3, 13))' 2>/dev/null; then python=$$p; break; fi; \
+	done; \
+	[ -x .venv/bin/python ] || { $(UV) venv --quiet --allow-existing --python $$python .venv; }
+	$(UV) sync --quiet --only-group build
+	$(UV) sync --quiet --all-extras
+	@touch $@
+
+demo: $(READY)
+	@$(RUN)chromeball demo
+
+office: $(READY)
+	@$(RUN)chromeball new office --example office --set data="$(DATA)" --if-absent
+	@PATH="$(CURDIR)/.venv/bin:$$PATH" $(MAKE) --no-print-directory -C office
+
+test: $(READY)
+	$(RUN)pytest
+
+lint: $(READY)
+	$(RUN)ruff check .
+	$(RUN)ruff format --check .
+	$(RUN)mypy
+	$(RUN)pyright
+
+bench: $(READY)
+	$(RUN)chromeball bench
+
+clean:
+	rm -rf .venv .tools build dist demo office

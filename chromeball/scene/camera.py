@@ -1,0 +1,367 @@
+"""One camera class over mrcal's lens models, fisheye projections and lat-long panoramas.
+
+Camera axes are x right, y down, z forward; pixel centres are at integers. A lat-long camera
+is the panorama itself as a camera; :data:`WORLD_FROM_LATLONG` turns its axes to OpenEXR's
+(centre +Z, image right -X, up +Y).
+"""
+
+from __future__ import annotations
+
+import ast
+import math
+import os
+import warnings
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from chromeball.scene.errors import UserError
+from chromeball.scene.pose import Pose
+from chromeball.scene.record import write_text
+
+#: Rotation from the axes of a lat-long camera to the world's.
+WORLD_FROM_LATLONG = Pose(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
+
+#: Fisheye projections: r = f * radius(theta), and its inverse, and the derivative.
+_FISHEYE = {
+    "equidistant": (lambda t: t, lambda r: r, lambda t: np.ones_like(t), math.pi),
+    "equisolid": (
+        lambda t: 2 * np.sin(t / 2),
+        lambda r: 2 * np.arcsin(np.clip(r / 2, -1, 1)),
+        lambda t: np.cos(t / 2),
+        math.pi,
+    ),
+    "stereographic": (
+        lambda t: 2 * np.tan(t / 2),
+        lambda r: 2 * np.arctan(r / 2),
+        lambda t: 1 / np.cos(t / 2) ** 2,
+        math.pi * 0.999,
+    ),
+    "orthographic": (
+        np.sin,
+        lambda r: np.arcsin(np.clip(r, -1, 1)),
+        np.cos,
+        math.pi / 2,
+    ),
+}
+FISHEYE_MODELS = (*_FISHEYE, "kb4")
+MODELS = ("pinhole", *FISHEYE_MODELS, "latlong")
+
+
+@dataclass(frozen=True)
+class CameraModel:
+    """A calibrated camera with its pose.
+
+    ``model``
+        ``pinhole`` (fx fy cx cy); ``equidistant``, ``equisolid``, ``stereographic``,
+        ``orthographic`` (f cx cy); ``kb4``, Kannala and Brandt 2006 (fx fy cx cy k1 k2 k3 k4,
+        r = theta + k1 theta^3 + ...); ``latlong`` (none); or one of mrcal's names,
+        ``LENSMODEL_...``, with mrcal's intrinsics.
+    ``size``
+        Width and height in pixels.
+    ``max_angle``
+        Largest angle from the optical axis that a fisheye sees, radians.
+    """
+
+    model: str
+    intrinsics: NDArray[np.float64]
+    size: tuple[int, int]
+    world_from_camera: Pose = field(default_factory=Pose.identity)
+    max_angle: float = math.pi
+
+    def __post_init__(self) -> None:
+        values = np.array(self.intrinsics, float).reshape(-1)
+        object.__setattr__(self, "intrinsics", values)
+        if self.model.startswith("LENSMODEL_"):
+            import mrcal
+
+            try:
+                expected = mrcal.lensmodel_num_params(self.model)
+            except (RuntimeError, TypeError) as error:
+                raise UserError(f"mrcal knows no lens model {self.model!r}") from error
+        elif self.model in MODELS:
+            expected = {"pinhole": 4, "kb4": 8, "latlong": 0}.get(self.model, 3)
+        else:
+            raise UserError(f"unknown camera model {self.model!r}; one of {', '.join(MODELS)}")
+        if len(values) != expected:
+            raise UserError(f"{self.model} has {expected} intrinsics, not {len(values)}")
+        if not np.isfinite(values).all() or min(self.size) < 1:
+            raise UserError(f"{self.model}: intrinsics and size must be finite and positive")
+
+    # ---- constructors
+
+    @classmethod
+    def pinhole(cls, size: tuple[int, int], fov: float, pose: Pose | None = None) -> Self:
+        """A perfect perspective camera; `fov` is horizontal, in radians."""
+        width, height = size
+        f = width / (2 * math.tan(fov / 2))
+        intrinsics = np.array([f, f, (width - 1) / 2, (height - 1) / 2])
+        return cls("pinhole", intrinsics, size, pose or Pose.identity())
+
+    @classmethod
+    def fisheye(
+        cls,
+        model: str,
+        size: tuple[int, int],
+        fov: float,
+        *,
+        centre: tuple[float, float] | None = None,
+        radius: float | None = None,
+        pose: Pose | None = None,
+    ) -> Self:
+        """A fisheye whose image circle of `radius` pixels spans `fov` radians."""
+        if model not in _FISHEYE:
+            raise UserError(f"unknown fisheye {model!r}; one of {', '.join(_FISHEYE)}")
+        width, height = size
+        cx, cy = centre or ((width - 1) / 2, (height - 1) / 2)
+        rim = float(_FISHEYE[model][0](np.float64(fov / 2)))
+        f = (min(size) / 2 if radius is None else radius) / rim
+        return cls(model, np.array([f, cx, cy]), size, pose or Pose.identity(), fov / 2)
+
+    @classmethod
+    def latlong(cls, size: tuple[int, int], pose: Pose | None = None) -> Self:
+        """A panorama; without a pose its axes are OpenEXR's in world space."""
+        return cls("latlong", np.zeros(0), size, pose or WORLD_FROM_LATLONG)
+
+    def posed(self, world_from_camera: Pose) -> CameraModel:
+        """The same camera elsewhere."""
+        return replace(self, world_from_camera=world_from_camera)
+
+    # ---- the mapping, in camera axes
+
+    def project(self, points: ArrayLike) -> NDArray[np.float64]:
+        """Points in camera axes to pixels, ``(..., 3) -> (..., 2)``; NaN where not seen."""
+        return self.project_with_jacobian(points)[0]
+
+    def project_with_jacobian(
+        self, points: ArrayLike
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """As :meth:`project`, and d pixel / d point, ``(..., 2, 3)``."""
+        p = np.ascontiguousarray(points, float)
+        if self.model.startswith("LENSMODEL_") or self.model == "pinhole":
+            import mrcal
+
+            name = "LENSMODEL_PINHOLE" if self.model == "pinhole" else self.model
+            q, dq_dp, _ = mrcal.project(p, name, self.intrinsics, get_gradients=True)
+            q, dq_dp = np.array(q, float), np.array(dq_dp, float)
+            if not _sees_behind(name):
+                behind = p[..., 2] <= 0
+                q[behind], dq_dp[behind] = np.nan, np.nan
+            return q, dq_dp
+        with np.errstate(divide="ignore", invalid="ignore"):
+            if self.model == "latlong":
+                return self._project_latlong(p)
+            return self._project_fisheye(p)
+
+    def unproject(self, pixels: ArrayLike) -> NDArray[np.float64]:
+        """Pixels to unit directions in camera axes, ``(..., 2) -> (..., 3)``; NaN outside."""
+        q = np.ascontiguousarray(pixels, float)
+        if self.model.startswith("LENSMODEL_") or self.model == "pinhole":
+            import mrcal
+
+            name = "LENSMODEL_PINHOLE" if self.model == "pinhole" else self.model
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", RuntimeWarning)
+                return np.array(mrcal.unproject(q, name, self.intrinsics, normalize=True), float)
+        if self.model == "latlong":
+            lon = ((q[..., 0] + 0.5) / self.size[0] - 0.5) * 2 * math.pi
+            lat = ((q[..., 1] + 0.5) / self.size[1] - 0.5) * math.pi
+            return np.stack(
+                [np.sin(lon) * np.cos(lat), np.sin(lat), np.cos(lon) * np.cos(lat)], axis=-1
+            )
+        fx, fy, cx, cy, _ = self._fisheye_parameters()
+        x, y = (q[..., 0] - cx) / fx, (q[..., 1] - cy) / fy
+        r = np.hypot(x, y)
+        theta = self._angle(r)
+        scale = np.where(r > 0, np.sin(theta) / np.where(r > 0, r, 1), 1.0)
+        d = np.stack([x * scale, y * scale, np.cos(theta)], axis=-1)
+        d[~(theta <= self.max_angle * (1 + 1e-9))] = np.nan
+        return d
+
+    # ---- in world axes
+
+    def rays(self, pixels: ArrayLike) -> NDArray[np.float64]:
+        """Unit directions in world axes through `pixels`, ``(..., 2) -> (..., 3)``."""
+        return self.world_from_camera.rotate(self.unproject(pixels))
+
+    def project_world(self, points: ArrayLike) -> NDArray[np.float64]:
+        """World points to pixels, ``(..., 3) -> (..., 2)``; NaN where not seen."""
+        return self.project(self.world_from_camera.inverse().apply(points))
+
+    def pixel_grid(self) -> NDArray[np.float64]:
+        """All pixel centres, ``(H, W, 2)``, x first."""
+        width, height = self.size
+        x, y = np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float))
+        return np.stack([x, y], axis=-1)
+
+    def scaled(self, factor: float) -> CameraModel:
+        """The same lens on a sensor with `factor` times as many pixels a side."""
+        size = (round(self.size[0] * factor), round(self.size[1] * factor))
+        values = self.intrinsics.copy()
+        if self.model != "latlong":
+            focal = 1 if self.model in _FISHEYE else 2
+            sx, sy = size[0] / self.size[0], size[1] / self.size[1]
+            values[:focal] *= [sx] if focal == 1 else [sx, sy]
+            values[focal] = (values[focal] + 0.5) * sx - 0.5
+            values[focal + 1] = (values[focal + 1] + 0.5) * sy - 0.5
+        return replace(self, intrinsics=values, size=size)
+
+    # ---- files, in mrcal's text format
+
+    @classmethod
+    def read(cls, path: str | os.PathLike[str]) -> Self:
+        """Read a ``.cameramodel``; a missing or broken one is a :class:`UserError`."""
+        try:
+            text = Path(path).read_text()
+            value: Any = ast.literal_eval(text.strip())
+            rt = np.array(value.get("rt_cam_ref", value.get("extrinsics", np.zeros(6))), float)
+            width, height = (int(n) for n in value["imagersize"])
+            name = str(value["lensmodel"])
+            return cls(
+                name.removeprefix("CHROMEBALL_").lower()
+                if name.startswith("CHROMEBALL_")
+                else name,
+                np.array(value["intrinsics"], float),
+                (width, height),
+                Pose.from_rotation_vector(rt[:3], rt[3:]).inverse(),
+                float(value.get("max_angle", math.pi)),
+            )
+        except FileNotFoundError as error:
+            raise UserError("no such camera model", file=path) from error
+        except UserError as error:
+            raise UserError(error.what, file=path) from error
+        except (OSError, SyntaxError, ValueError, TypeError, KeyError, AttributeError) as error:
+            reason = f"{type(error).__name__}: {error}"
+            raise UserError(f"not a readable camera model ({reason})", file=path) from error
+
+    def text(self) -> str:
+        """The ``.cameramodel`` text: mrcal reads it whenever the lens is one of mrcal's."""
+        camera_from_world = self.world_from_camera.inverse()
+        rt = [*camera_from_world.rotation_vector(), *camera_from_world.translation]
+        if self.model == "pinhole":
+            name = "LENSMODEL_PINHOLE"
+        elif self.model.startswith("LENSMODEL_"):
+            name = self.model
+        else:
+            name = f"CHROMEBALL_{self.model.upper()}"
+        lines = [
+            f"    'lensmodel':  '{name}',",
+            f"    'intrinsics': [ {', '.join(repr(float(v)) for v in self.intrinsics)} ],",
+            f"    'rt_cam_ref': [ {', '.join(repr(float(v)) for v in rt)} ],",
+            f"    'imagersize': [ {self.size[0]}, {self.size[1]} ],",
+        ]
+        if self.model in FISHEYE_MODELS:
+            lines.append(f"    'max_angle':  {self.max_angle!r},")
+        return "{\n" + "\n".join(lines) + "\n}\n"
+
+    def write(self, path: str | os.PathLike[str]) -> None:
+        """Write the ``.cameramodel``, whole or not at all."""
+        write_text(path, self.text())
+
+    # ---- formulas
+
+    def _fisheye_parameters(self) -> tuple[float, float, float, float, NDArray[np.float64]]:
+        if self.model == "kb4":
+            fx, fy, cx, cy = self.intrinsics[:4]
+            return fx, fy, cx, cy, self.intrinsics[4:]
+        f, cx, cy = self.intrinsics
+        return f, f, cx, cy, np.zeros(0)
+
+    def _radius(
+        self, theta: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Distance from the principal point over f, and its derivative."""
+        if self.model == "kb4":
+            k = self.intrinsics[4:]
+            powers = np.stack([theta ** (2 * i + 1) for i in range(5)], axis=-1)
+            slopes = np.stack([(2 * i + 1) * theta ** (2 * i) for i in range(5)], axis=-1)
+            coefficients = np.concatenate([[1.0], k])
+            return powers @ coefficients, slopes @ coefficients
+        radius, _, slope, _ = _FISHEYE[self.model]
+        return radius(theta), slope(theta)
+
+    def _angle(self, r: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Inverse of `_radius`; NaN where the lens has no such radius."""
+        if self.model != "kb4":
+            limit = _FISHEYE[self.model][3]
+            rim = _FISHEYE[self.model][0](np.float64(min(limit, math.pi)))
+            return np.where(r <= rim, _FISHEYE[self.model][1](r), np.nan)
+        # Newton from a table of the monotone part, so that it converges everywhere on it.
+        table = np.linspace(0, self.max_angle, 1024)
+        radii, slopes = self._radius(table)
+        rising = np.cumprod(slopes > 0).astype(bool)
+        table, radii = table[rising], radii[rising]
+        theta = np.interp(r, radii, table, right=np.nan)
+        for _ in range(4):
+            radius, slope = self._radius(theta)
+            theta = theta - (radius - r) / slope
+        return theta
+
+    def _project_fisheye(
+        self, p: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        fx, fy, cx, cy, _ = self._fisheye_parameters()
+        x, y, z = p[..., 0], p[..., 1], p[..., 2]
+        rho = np.hypot(x, y)
+        norm2 = rho**2 + z**2
+        theta = np.arctan2(rho, z)
+        r, slope = self._radius(theta)
+        on_axis = rho == 0
+        safe = np.where(on_axis, 1.0, rho)
+        ux, uy = np.where(on_axis, 1.0, x / safe), np.where(on_axis, 0.0, y / safe)
+        # r / rho tends to slope / z on the axis.
+        tangential = np.where(on_axis, slope / np.where(z == 0, np.nan, z), r / safe)
+        radial = slope * z / norm2
+        q = np.stack([fx * tangential * x + cx, fy * tangential * y + cy], axis=-1)
+        # d(r u)/dp = slope u dtheta/dp + (r / rho) (dp_xy - u u' dp_xy)
+        dx = np.stack(
+            [
+                radial * ux * ux + tangential * uy * uy,
+                (radial - tangential) * ux * uy,
+                -slope * rho / norm2 * ux,
+            ],
+            axis=-1,
+        )
+        dy = np.stack(
+            [
+                (radial - tangential) * ux * uy,
+                radial * uy * uy + tangential * ux * ux,
+                -slope * rho / norm2 * uy,
+            ],
+            axis=-1,
+        )
+        jacobian = np.stack([fx * dx, fy * dy], axis=-2)
+        unseen = ~(theta <= self.max_angle * (1 + 1e-9)) | (norm2 == 0)
+        q[unseen], jacobian[unseen] = np.nan, np.nan
+        return q, jacobian
+
+    def _project_latlong(
+        self, p: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        x, y, z = p[..., 0], p[..., 1], p[..., 2]
+        width, height = self.size
+        rho2 = x**2 + z**2
+        rho, norm2 = np.sqrt(rho2), rho2 + y**2
+        q = np.stack(
+            [
+                (np.arctan2(x, z) / (2 * math.pi) + 0.5) * width - 0.5,
+                (np.arctan2(y, rho) / math.pi + 0.5) * height - 0.5,
+            ],
+            axis=-1,
+        )
+        zero = np.zeros_like(x)
+        du = np.stack([z / rho2, zero, -x / rho2], axis=-1) * (width / (2 * math.pi))
+        dv = np.stack([-x * y / rho, rho, -z * y / rho], axis=-1)
+        dv = dv / norm2[..., None] * (height / math.pi)
+        q[norm2 == 0] = np.nan
+        return q, np.stack([du, dv], axis=-2)
+
+
+def _sees_behind(lensmodel: str) -> bool:
+    """Whether one of mrcal's lens models is defined beyond 90 degrees."""
+    return lensmodel.startswith(
+        ("LENSMODEL_STEREOGRAPHIC", "LENSMODEL_LATLON", "LENSMODEL_LONLAT", "LENSMODEL_SPLINED")
+    )

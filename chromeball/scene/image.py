@@ -1,0 +1,295 @@
+"""Pictures in and out: OpenImageIO for EXR, HDR, TIFF, PNG and JPEG, rawpy for camera RAW."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chromeball.scene.color import REC709_CHROMATICITIES, srgb_encode
+from chromeball.scene.errors import UserError
+from chromeball.scene.record import atomic_output
+
+RAW_SUFFIXES = frozenset(
+    {".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw"}
+)
+LINEAR_SUFFIXES = frozenset({".exr", ".hdr", ".pfm"}) | RAW_SUFFIXES
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """What the metadata say of one exposure; ``None`` where they are silent.
+
+    ``time`` in seconds, ``aperture`` as f-number, ``iso`` as ISO speed.
+    """
+
+    time: float | None = None
+    aperture: float | None = None
+    iso: float | None = None
+    camera: str | None = None
+    lens: str | None = None
+
+
+@dataclass(frozen=True)
+class Image:
+    """A picture as it was stored.
+
+    ``pixels`` is (H, W, C) in its own type: uint8, uint16 or float32 (half is widened).
+    ``linear`` says that the values are proportional to radiance (EXR, HDR, RAW).
+    """
+
+    pixels: NDArray[Any]
+    linear: bool
+    channels: tuple[str, ...]
+    exposure: Exposure = field(default_factory=Exposure)
+    attributes: Mapping[str, Any] = field(default_factory=dict[str, Any])
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height in pixels."""
+        return self.pixels.shape[1], self.pixels.shape[0]
+
+
+def read_image(path: str | os.PathLike[str]) -> Image:
+    """Read a whole picture with its exposure metadata.
+
+    Raises
+    ------
+    UserError
+        When the file is missing, truncated, or no picture.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise UserError("no such picture", file=path)
+    if path.suffix.lower() in RAW_SUFFIXES:
+        return _read_raw(path)
+    import OpenImageIO as oiio
+
+    source = oiio.ImageInput.open(os.fspath(path))
+    if source is None:
+        raise UserError(f"not a readable picture: {_last_line(oiio.geterror())}", file=path)
+    try:
+        spec = source.spec()
+        base = {"uint8": "uint8", "uint16": "uint16"}.get(str(spec.format), "float")
+        pixels = source.read_image(0, 0, 0, spec.nchannels, base)
+        if pixels is None or source.has_error:
+            raise UserError(
+                f"truncated or damaged picture: {_last_line(source.geterror())}", file=path
+            )
+    finally:
+        source.close()
+    if path.suffix.lower() in {".jpg", ".jpeg"} and not _jpeg_is_whole(path):
+        raise UserError("truncated picture: the JPEG ends early", file=path)
+    pixels = np.ascontiguousarray(pixels).reshape(spec.height, spec.width, spec.nchannels)
+    attributes = {a.name: a.value for a in spec.extra_attribs}
+    return Image(
+        pixels=pixels,
+        linear=path.suffix.lower() in LINEAR_SUFFIXES or base == "float",
+        channels=tuple(spec.channelnames),
+        exposure=_exposure(attributes),
+        attributes=attributes,
+    )
+
+
+def read_exposure(path: str | os.PathLike[str]) -> Exposure:
+    """Read the exposure metadata alone, without the pixels."""
+    path = Path(path)
+    if not path.is_file():
+        raise UserError("no such picture", file=path)
+    import OpenImageIO as oiio
+
+    source = oiio.ImageInput.open(os.fspath(path))
+    if source is None:
+        if path.suffix.lower() in RAW_SUFFIXES:
+            return _read_raw(path).exposure
+        raise UserError(f"not a readable picture: {_last_line(oiio.geterror())}", file=path)
+    attributes = {a.name: a.value for a in source.spec().extra_attribs}
+    source.close()
+    return _exposure(attributes)
+
+
+def read_rgb(path: str | os.PathLike[str]) -> NDArray[np.float32]:
+    """Read a scene-linear picture as (H, W, 3) float32; grey is repeated, alpha left out.
+
+    Raises
+    ------
+    UserError
+        When it is not linear, or holds NaN, infinite or negative values.
+    """
+    image = read_image(path)
+    if not image.linear:
+        raise UserError("not a scene-linear picture; merge it with `hdr merge` first", file=path)
+    pixels = image.pixels.astype(np.float32, copy=False)
+    names = list(image.channels)
+    if all(name in names for name in "RGB"):
+        rgb = pixels[..., [names.index(name) for name in "RGB"]]
+    elif pixels.shape[2] >= 3:
+        rgb = pixels[..., :3]
+    else:
+        rgb = np.repeat(pixels[..., :1], 3, axis=2)
+    bad = ~np.isfinite(rgb) | (rgb < 0)
+    if bad.any():
+        y, x, _ = np.argwhere(bad)[0]
+        raise UserError(
+            f"{int(bad.any(axis=2).sum())} pixels are NaN, infinite or negative, "
+            f"the first at x {x}, y {y}",
+            file=path,
+        )
+    return np.ascontiguousarray(rgb)
+
+
+def write_exr(
+    path: str | os.PathLike[str],
+    pixels: NDArray[Any],
+    *,
+    channels: Sequence[str] = ("R", "G", "B"),
+    attributes: Mapping[str, Any] | None = None,
+) -> None:
+    """Write (H, W, C) as float32 OpenEXR (zip), whole or not at all.
+
+    Values of `attributes` are str, int, float or sequences of floats; ``chromaticities`` are
+    Rec.709 unless given.
+    """
+    import OpenImageIO as oiio
+
+    pixels = np.ascontiguousarray(pixels, np.float32)
+    if pixels.ndim == 2:
+        pixels = pixels[..., None]
+    height, width, count = pixels.shape
+    if count != len(channels):
+        raise ValueError(f"{count} channels of pixels, {len(channels)} names")
+    spec = oiio.ImageSpec(width, height, count, "float")
+    spec.channelnames = tuple(channels)
+    spec.attribute("compression", "zip")
+    merged: dict[str, Any] = {"chromaticities": REC709_CHROMATICITIES, **(attributes or {})}
+    for name, value in merged.items():
+        match value:
+            case bool() | int():
+                spec.attribute(name, int(value))
+            case str():
+                spec.attribute(name, value)
+            case float():
+                spec.attribute(name, float(value))
+            case _:
+                flat = tuple(float(v) for v in np.ravel(value))
+                kind = "float" if len(flat) == 1 else f"float[{len(flat)}]"
+                spec.attribute(name, oiio.TypeDesc(kind), flat)
+    with atomic_output(path) as temporary:
+        _write(temporary, spec, pixels, path)
+
+
+def write_picture(
+    path: str | os.PathLike[str],
+    pixels: NDArray[np.uint8] | NDArray[np.uint16],
+    *,
+    exposure: Exposure | None = None,
+    quality: int = 95,
+) -> None:
+    """Write (H, W, C) codes as PNG, JPEG or TIFF with exposure metadata, whole or not at all."""
+    import OpenImageIO as oiio
+
+    if pixels.ndim == 2:
+        pixels = pixels[..., None]
+    height, width, count = pixels.shape
+    spec = oiio.ImageSpec(width, height, count, str(pixels.dtype))
+    if Path(path).suffix.lower() in {".jpg", ".jpeg"}:
+        spec.attribute("Compression", f"jpeg:{quality}")
+        spec.attribute("jpeg:subsampling", "4:4:4")
+    if exposure is not None:
+        if exposure.time is not None:
+            spec.attribute("ExposureTime", float(exposure.time))
+        if exposure.aperture is not None:
+            spec.attribute("FNumber", float(exposure.aperture))
+        if exposure.iso is not None:
+            spec.attribute("Exif:PhotographicSensitivity", int(exposure.iso))
+        if exposure.camera is not None:
+            spec.attribute("Model", exposure.camera)
+        if exposure.lens is not None:
+            spec.attribute("Exif:LensModel", exposure.lens)
+    with atomic_output(path) as temporary:
+        _write(temporary, spec, np.ascontiguousarray(pixels), path)
+
+
+def to_display(rgb: NDArray[Any], exposure: float = 1.0) -> NDArray[np.uint8]:
+    """Scene-linear (H, W, 3) to 8-bit sRGB at `exposure`, for looking at (it clips)."""
+    codes = 255 * srgb_encode(np.clip(np.asarray(rgb, np.float32) * exposure, 0, 1)) + 0.5
+    return codes.astype(np.uint8)
+
+
+def _write(temporary: Path, spec: Any, pixels: NDArray[Any], path: str | os.PathLike[str]) -> None:
+    import OpenImageIO as oiio
+
+    target = oiio.ImageOutput.create(os.fspath(temporary))
+    if target is None:
+        raise UserError(f"no picture format for this name: {_last_line(oiio.geterror())}", file=path)
+    if not (target.open(os.fspath(temporary), spec) and target.write_image(pixels)):
+        raise UserError(f"cannot write: {_last_line(target.geterror())}", file=path)
+    if not target.close():
+        raise UserError(f"cannot write: {_last_line(target.geterror())}", file=path)
+
+
+def _read_raw(path: Path) -> Image:
+    import rawpy
+
+    try:
+        with rawpy.imread(os.fspath(path)) as raw:
+            pixels = raw.postprocess(
+                gamma=(1, 1),
+                no_auto_bright=True,
+                output_bps=16,
+                use_camera_wb=True,
+                output_color=rawpy.ColorSpace.sRGB,
+                user_flip=0,
+            )
+            other: Any = getattr(raw, "other", None)
+            exposure = Exposure(
+                time=_positive(getattr(other, "shutter", None)),
+                aperture=_positive(getattr(other, "aperture", None)),
+                iso=_positive(getattr(other, "iso_speed", None)),
+            )
+    except (rawpy.LibRawError, OSError) as error:
+        raise UserError(f"not a readable RAW picture: {error}", file=path) from error
+    return Image(pixels=pixels, linear=True, channels=("R", "G", "B"), exposure=exposure)
+
+
+def _exposure(attributes: Mapping[str, Any]) -> Exposure:
+    time = _positive(attributes.get("ExposureTime"))
+    if time is None and (apex := attributes.get("Exif:ShutterSpeedValue")) is not None:
+        time = _positive(2.0 ** -float(apex))
+    return Exposure(
+        time=time,
+        aperture=_positive(attributes.get("FNumber")),
+        iso=_positive(
+            attributes.get("Exif:PhotographicSensitivity", attributes.get("Exif:ISOSpeedRatings"))
+        ),
+        camera=_text(attributes.get("Model")),
+        lens=_text(attributes.get("Exif:LensModel")),
+    )
+
+
+def _positive(value: Any) -> float | None:
+    if isinstance(value, int | float | np.number) and math.isfinite(value) and value > 0:
+        return float(value)
+    return None
+
+
+def _text(value: Any) -> str | None:
+    return value.strip() or None if isinstance(value, str) else None
+
+
+def _jpeg_is_whole(path: Path) -> bool:
+    """Whether an end-of-image marker stands in the last 64 KiB (cameras append their own data)."""
+    with path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - 65536))
+        return b"\xff\xd9" in file.read()
+
+
+def _last_line(message: str) -> str:
+    lines = message.strip().splitlines()
+    return lines[-1] if lines else "unknown format"

@@ -1,0 +1,343 @@
+"""The scene file: one typed TOML that names every source, and nothing it does not know.
+
+Paths are relative to the file. Angles are degrees here, where a person types; metres
+throughout. An unknown key is an error that names the nearest known one.
+"""
+
+from __future__ import annotations
+
+import difflib
+import os
+import re
+import tomllib
+from fractions import Fraction
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args, get_type_hints
+
+import msgspec
+from msgspec import Meta, Struct
+
+from chromeball.scene.errors import UserError
+
+type Positive = Annotated[float, Meta(gt=0)]
+type Point = tuple[float, float]
+type Vector = tuple[float, float, float]
+type Quad = tuple[Point, Point, Point, Point]
+type Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$")]
+
+
+class Table(Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
+    """A table of the scene file."""
+
+
+class Emulate(Table):
+    """A virtual camera on a pseudo-terminal, in place of a device.
+
+    ``radiance``: the EXR that stands before its lens. ``standard``: video system.
+    """
+
+    radiance: str
+    seed: int = 0
+
+
+class Bracket(Table):
+    """One exposure bracket: a take of a device, or photographs that lie in a folder.
+
+    ``frames`` are paths or patterns; ``times`` their exposure times (seconds or "1/30") where
+    the pictures' metadata is silent. With ``device`` (``visca:/dev/ttyUSB0``) and ``video``
+    (``v4l2:/dev/video0``), `acquire bracket` makes ``take``.
+    """
+
+    name: Name
+    frames: list[str] = []
+    times: list[float | str] = []
+    take: str | None = None
+    device: str | None = None
+    video: str | None = None
+    emulate: Emulate | None = None
+
+
+class Hdr(Table):
+    """Response and merge. ``response``: a stored curve; else it is solved from ``solve_from``.
+
+    ``smoothness`` is Debevec and Malik's lambda.
+    """
+
+    response: str | None = None
+    solve_from: list[Name] = []
+    smoothness: Positive | None = None
+
+
+class Lens(Table):
+    """An ideal fisheye: ``fov`` across the image circle of ``radius`` pixels at ``centre``."""
+
+    model: Literal["equidistant", "equisolid", "stereographic", "orthographic"]
+    fov: Annotated[float, Meta(gt=0, le=360)]
+    radius: Positive | None = None
+    centre: Point | None = None
+
+
+class Shot(Table):
+    """One direction of the light probe: its bracket and its turn about the vertical."""
+
+    bracket: Name
+    yaw: float = 0.0
+    pitch: float = 0.0
+    roll: float = 0.0
+
+
+class Probe(Table):
+    """The light probe: shots with one lens, a model of it or a ``camera`` file.
+
+    ``vignetting``: c1, c2, ... of the fall-off 1 + c1 r^2 + c2 r^4 + ..., r = 1 at the rim of
+    the image circle; measured values are divided by it.
+    """
+
+    shot: list[Shot]
+    lens: Lens | None = None
+    camera: str | None = None
+    vignetting: list[float] = []
+
+
+class Align(Table):
+    """World axes and scale from the four corners of a rectangle on the floor.
+
+    ``picture``: the name of the probe shot's bracket that the points were clicked in, or
+    ``env`` for a finished panorama. ``width`` is the length from the first corner to the
+    second, ``depth`` from the second to the third; one of them or ``camera_height`` in metres.
+    The world's origin is the middle of the rectangle, +X runs along its width, +Y is up.
+    """
+
+    points: Quad
+    picture: str
+    width: Positive | None = None
+    depth: Positive | None = None
+    camera_height: Positive | None = None
+
+
+class Env(Table):
+    """The lat-long map. ``file``: a finished panorama, so that nothing is stitched.
+
+    ``lights``: how many light samples `envmap lights` writes.
+    """
+
+    width: Annotated[int, Meta(ge=16, le=32768)] = 1024
+    file: str | None = None
+    lights: Annotated[int, Meta(ge=1, le=65536)] = 64
+
+
+class StandIn(Table):
+    """One piece of stand-in geometry.
+
+    ``plane``: a rectangle of ``size`` metres on the floor about the world's origin.
+    ``polygon``: corners on the floor. ``box``: a polygon raised to ``height``.
+    ``room``: a polygon raised to ``height`` and seen from inside.
+    Corners are ``points``, pixels in env.exr, or ``corners``, (x, z) in metres on the floor;
+    ``height`` in metres, or ``height_point``, the pixel above the first corner.
+    ``surface``: support receives shadows and light of the objects, environment only emits.
+    For a room the floor is ``surface`` and walls and ceiling are environment.
+    """
+
+    name: Name
+    kind: Literal["plane", "polygon", "box", "room"]
+    points: list[Point] = []
+    corners: list[Point] = []
+    size: tuple[Positive, Positive] | None = None
+    height: Positive | None = None
+    height_point: Point | None = None
+    surface: Literal["support", "environment"] = "support"
+
+
+class Material(Table):
+    """``color``: albedo of diffuse, reflectance of mirror, transmittance of glass."""
+
+    kind: Literal["diffuse", "mirror", "glass"] = "diffuse"
+    color: tuple[
+        Annotated[float, Meta(ge=0, le=1)],
+        Annotated[float, Meta(ge=0, le=1)],
+        Annotated[float, Meta(ge=0, le=1)],
+    ] = (0.5, 0.5, 0.5)
+    ior: Annotated[float, Meta(ge=1, le=4)] = 1.5
+
+
+class Object(Table):
+    """A synthetic object: ``mesh`` is sphere, box or cylinder (unit size, standing on y = 0), or a
+    mesh file; scaled, then rotated (degrees about x, y, z in turn), then moved to ``position``.
+    """
+
+    name: Name
+    mesh: str
+    position: Vector = (0.0, 0.0, 0.0)
+    rotation: Vector = (0.0, 0.0, 0.0)
+    scale: Positive | tuple[Positive, Positive, Positive] = 1.0
+    material: Material = Material()
+
+
+class View(Table):
+    """A picture to make.
+
+    With ``bracket`` or ``plate`` (a radiance EXR) a photograph is the background; its camera is
+    the calibrated one (``camera`` names a file, default the result of `calibrate lens`) and its
+    place follows from ``points``, where the four corners of the `align` rectangle lie in the
+    plate. Without, the panorama is the background, seen from the probe's place by a virtual
+    camera: ``model``, ``size``, ``fov`` degrees, turned to ``look_at`` (a point in metres).
+    """
+
+    name: Name
+    bracket: Name | None = None
+    plate: str | None = None
+    camera: str | None = None
+    points: Quad | None = None
+    model: Literal[
+        "pinhole", "equidistant", "equisolid", "stereographic", "orthographic", "latlong"
+    ] = "pinhole"
+    size: tuple[Annotated[int, Meta(ge=1)], Annotated[int, Meta(ge=1)]] = (640, 480)
+    fov: Annotated[float, Meta(gt=0, le=360)] = 60.0
+    look_at: Vector = (0.0, 0.0, 0.0)
+    exposure: Positive | None = None
+
+
+class Calibrate(Table):
+    """The view camera: photographs of a target, or a finished ``camera``."""
+
+    images: list[str] = []
+    target: str | None = None
+    model: str = "opencv8"
+    camera: str | None = None
+
+
+class Render(Table):
+    """How the objects are rendered into the views."""
+
+    spp: Annotated[int, Meta(ge=1)] = 64
+    seed: int = 0
+    bounces: Annotated[int, Meta(ge=0)] = 4
+    composite: Literal["quotient", "difference"] = "quotient"
+
+
+class Truth(Table):
+    """What an example knows about itself. Only the report reads it."""
+
+    folder: str
+
+
+class Scene(Table):
+    """A whole scene file. ``folder`` holds what the stages make."""
+
+    name: str
+    folder: str = "build"
+    bracket: list[Bracket] = []
+    hdr: Hdr = Hdr()
+    calibrate: Calibrate | None = None
+    probe: Probe | None = None
+    align: Align | None = None
+    env: Env = Env()
+    stand_in: list[StandIn] = []
+    object: list[Object] = []
+    view: list[View] = []
+    render: Render = Render()
+    truth: Truth | None = None
+
+    def find_bracket(self, name: str) -> Bracket:
+        """The bracket of that name, or a :class:`UserError`."""
+        for bracket in self.bracket:
+            if bracket.name == name:
+                return bracket
+        raise UserError(f"there is no [[bracket]] named {name!r}{_nearest(name, [b.name for b in self.bracket])}")
+
+
+def read_scene(path: str | os.PathLike[str]) -> Scene:
+    """Read and check a scene file.
+
+    Raises
+    ------
+    UserError
+        With the place in the file: no such file, not TOML, an unknown key (the nearest known
+        one is named), a wrong type or value, a name used twice or never defined.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except FileNotFoundError as error:
+        raise UserError("no such scene file", file=path) from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"not a readable text file: {error}", file=path) from error
+    return parse_scene(text, path)
+
+
+def parse_scene(text: str, path: str | os.PathLike[str] = "scene.toml") -> Scene:
+    """As :func:`read_scene`, from the text; `path` is for messages alone."""
+    try:
+        value = tomllib.loads(text)
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise UserError(f"not valid TOML: {error}", file=path) from error
+    try:
+        scene = msgspec.convert(value, Scene)
+        _check_names(scene)
+    except msgspec.ValidationError as error:
+        raise UserError(_explain(str(error)), file=path) from error
+    except UserError as error:
+        raise UserError(error.what, file=path) from error
+    return scene
+
+
+def parse_time(value: float | str) -> float:
+    """An exposure time in seconds from a number, "0.5" or "1/30"."""
+    try:
+        seconds = float(Fraction(value)) if isinstance(value, str) else float(value)
+    except (ValueError, ZeroDivisionError, OverflowError) as error:
+        raise UserError(f"{value!r} is no exposure time: write 0.5 or 1/30") from error
+    if not 0 < seconds < 1e6:
+        raise UserError(f"{value!r} is no exposure time: it must be positive and finite")
+    return seconds
+
+
+def _check_names(scene: Scene) -> None:
+    for kind, entries in (
+        ("bracket", scene.bracket),
+        ("stand_in", scene.stand_in),
+        ("object", scene.object),
+        ("view", scene.view),
+    ):
+        names = [entry.name for entry in entries]
+        for name in names:
+            if names.count(name) > 1:
+                raise UserError(f"two [[{kind}]] are named {name!r}")
+    used = [shot.bracket for shot in (scene.probe.shot if scene.probe else [])]
+    used += [view.bracket for view in scene.view if view.bracket]
+    used += scene.hdr.solve_from
+    for name in used:
+        scene.find_bracket(name)
+    for bracket in scene.bracket:
+        for time in bracket.times:
+            parse_time(time)
+
+
+def _explain(message: str) -> str:
+    """Msgspec's message, with the nearest known key for an unknown one."""
+    found = re.search(r"unknown field `(.*?)`(?: - at `(.*)`)?", message)
+    if not found:
+        return message.replace("`$.", "`")
+    field, where = found[1], found[2] or "$"
+    table: Any = Scene
+    for part in re.findall(r"\.(\w+)", where):
+        table = _table_of(get_type_hints(table)[part])
+    place = re.sub(r"^\$\.?", "", where).replace("[...]", "")
+    return f"unknown key {field!r} in {f'[{place}]' if place else 'the file'}" + _nearest(
+        field, table.__struct_fields__
+    )
+
+
+def _table_of(annotation: Any) -> Any:
+    if isinstance(annotation, type) and issubclass(annotation, Struct):
+        return annotation
+    for argument in get_args(annotation):
+        if (table := _table_of(argument)) is not None:
+            return table
+    return None
+
+
+def _nearest(name: str, known: tuple[str, ...] | list[str]) -> str:
+    close = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+    if close:
+        return f"; did you mean {close[0]!r}?"
+    return f"; known: {', '.join(sorted(known))}" if known else ""

@@ -1,0 +1,1 @@
+"""Floor 2: radiance frames to the light around a point."""

@@ -1,0 +1,1 @@
+"""Example scenes, copied by `chromeball new --example NAME`."""
