@@ -3,8 +3,8 @@ SHELL := /bin/bash
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 
-# uv from the PATH, else one of our own in .tools/
-UV := $(or $(shell command -v uv 2>/dev/null),.tools/bin/uv)
+# uv from the PATH if it runs (pyenv's shim may be there and fail), else our own in .tools/
+UV := $(shell uv --version >/dev/null 2>&1 && echo uv || echo .tools/bin/uv)
 RUN := .venv/bin/
 READY := .venv/.ready
 SOURCES := pyproject.toml CMakeLists.txt .python-version \
@@ -35,9 +35,12 @@ setup: $(READY)
 	@mkdir -p .venv && touch $@
 
 .tools/bin/uv:
-	@python3 -m venv .tools 2>/dev/null || { \
+	@for p in $${PYENV_ROOT:-$$HOME/.pyenv}/versions/3.13*/bin/python3.13 python3 /usr/bin/python3; do \
+	  $$p -m venv --clear .tools 2>/dev/null && break; \
+	done; \
+	[ -x .tools/bin/pip ] || { \
 	  if [ "$$(id -u)" = 0 ]; then sudo=; else sudo=sudo; fi; \
-	  $$sudo apt-get update -qq && $$sudo apt-get install -y python3-venv && python3 -m venv --clear .tools; }
+	  $$sudo apt-get update -qq && $$sudo apt-get install -y python3-venv && /usr/bin/python3 -m venv --clear .tools; }
 	@.tools/bin/pip install --quiet uv
 
 # Python 3.13: from the PATH or from pyenv's versions folder (its shims may be there and fail),

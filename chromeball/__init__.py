@@ -1,1 +1,1 @@
-"""chromeball: capture light, calibrate cameras and insert synthetic objects into real places."""
+"""Capture light, calibrate cameras and insert synthetic objects into real places."""

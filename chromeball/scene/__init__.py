@@ -1,1 +1,1 @@
-"""Ground floor: what every room speaks (scene file, cameras, poses, images, records, errors)."""
+"""Ground floor: what every room speaks."""

@@ -11,6 +11,7 @@ import ast
 import math
 import os
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
@@ -26,7 +27,8 @@ from chromeball.scene.record import write_text
 WORLD_FROM_LATLONG = Pose(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
 
 #: Fisheye projections: r = f * radius(theta), and its inverse, and the derivative.
-_FISHEYE = {
+type Radial = Callable[[Any], Any]
+_FISHEYE: dict[str, tuple[Radial, Radial, Radial, float]] = {
     "equidistant": (lambda t: t, lambda r: r, lambda t: np.ones_like(t), math.pi),
     "equisolid": (
         lambda t: 2 * np.sin(t / 2),
@@ -79,7 +81,7 @@ class CameraModel:
             import mrcal
 
             try:
-                expected = mrcal.lensmodel_num_params(self.model)
+                expected = mrcal.lensmodel_num_params(self.model)  # pyright: ignore[reportAttributeAccessIssue]
             except (RuntimeError, TypeError) as error:
                 raise UserError(f"mrcal knows no lens model {self.model!r}") from error
         elif self.model in MODELS:
@@ -165,7 +167,9 @@ class CameraModel:
             name = "LENSMODEL_PINHOLE" if self.model == "pinhole" else self.model
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", RuntimeWarning)
-                return np.array(mrcal.unproject(q, name, self.intrinsics, normalize=True), float)
+                return np.array(
+                    mrcal.unproject(q, name, self.intrinsics, normalize=True), float
+                )
         if self.model == "latlong":
             lon = ((q[..., 0] + 0.5) / self.size[0] - 0.5) * 2 * math.pi
             lat = ((q[..., 1] + 0.5) / self.size[1] - 0.5) * math.pi
@@ -220,10 +224,10 @@ class CameraModel:
             rt = np.array(value.get("rt_cam_ref", value.get("extrinsics", np.zeros(6))), float)
             width, height = (int(n) for n in value["imagersize"])
             name = str(value["lensmodel"])
+            if name == "LENSMODEL_PINHOLE" or name.startswith("CHROMEBALL_"):
+                name = name.partition("_")[2].lower()
             return cls(
-                name.removeprefix("CHROMEBALL_").lower()
-                if name.startswith("CHROMEBALL_")
-                else name,
+                name,
                 np.array(value["intrinsics"], float),
                 (width, height),
                 Pose.from_rotation_vector(rt[:3], rt[3:]).inverse(),

@@ -19,6 +19,7 @@ class UserError(Exception):
         What is wrong and what to do, a sentence for a person on a film set at night.
     file
         The file it is about, put in front of the message.
+
     """
 
     exit_code = 2

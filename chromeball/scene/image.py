@@ -63,6 +63,7 @@ def read_image(path: str | os.PathLike[str]) -> Image:
     ------
     UserError
         When the file is missing, truncated, or no picture.
+
     """
     path = Path(path)
     if not path.is_file():
@@ -121,10 +122,13 @@ def read_rgb(path: str | os.PathLike[str]) -> NDArray[np.float32]:
     ------
     UserError
         When it is not linear, or holds NaN, infinite or negative values.
+
     """
     image = read_image(path)
     if not image.linear:
-        raise UserError("not a scene-linear picture; merge it with `hdr merge` first", file=path)
+        raise UserError(
+            "not a scene-linear picture; merge it with `hdr merge` first", file=path
+        )
     pixels = image.pixels.astype(np.float32, copy=False)
     names = list(image.channels)
     if all(name in names for name in "RGB"):
@@ -191,7 +195,7 @@ def write_picture(
     exposure: Exposure | None = None,
     quality: int = 95,
 ) -> None:
-    """Write (H, W, C) codes as PNG, JPEG or TIFF with exposure metadata, whole or not at all."""
+    """Write (H, W, C) codes as PNG, JPEG or TIFF with metadata, whole or not at all."""
     import OpenImageIO as oiio
 
     if pixels.ndim == 2:
@@ -222,12 +226,16 @@ def to_display(rgb: NDArray[Any], exposure: float = 1.0) -> NDArray[np.uint8]:
     return codes.astype(np.uint8)
 
 
-def _write(temporary: Path, spec: Any, pixels: NDArray[Any], path: str | os.PathLike[str]) -> None:
+def _write(
+    temporary: Path, spec: Any, pixels: NDArray[Any], path: str | os.PathLike[str]
+) -> None:
     import OpenImageIO as oiio
 
     target = oiio.ImageOutput.create(os.fspath(temporary))
     if target is None:
-        raise UserError(f"no picture format for this name: {_last_line(oiio.geterror())}", file=path)
+        raise UserError(
+            f"no picture format for this name: {_last_line(oiio.geterror())}", file=path
+        )
     if not (target.open(os.fspath(temporary), spec) and target.write_image(pixels)):
         raise UserError(f"cannot write: {_last_line(target.geterror())}", file=path)
     if not target.close():
@@ -266,7 +274,9 @@ def _exposure(attributes: Mapping[str, Any]) -> Exposure:
         time=time,
         aperture=_positive(attributes.get("FNumber")),
         iso=_positive(
-            attributes.get("Exif:PhotographicSensitivity", attributes.get("Exif:ISOSpeedRatings"))
+            attributes.get(
+                "Exif:PhotographicSensitivity", attributes.get("Exif:ISOSpeedRatings")
+            )
         ),
         camera=_text(attributes.get("Model")),
         lens=_text(attributes.get("Exif:LensModel")),
@@ -275,7 +285,7 @@ def _exposure(attributes: Mapping[str, Any]) -> Exposure:
 
 def _positive(value: Any) -> float | None:
     if isinstance(value, int | float | np.number) and math.isfinite(value) and value > 0:
-        return float(value)
+        return float(value)  # pyright: ignore[reportArgumentType]
     return None
 
 
@@ -284,7 +294,7 @@ def _text(value: Any) -> str | None:
 
 
 def _jpeg_is_whole(path: Path) -> bool:
-    """Whether an end-of-image marker stands in the last 64 KiB (cameras append their own data)."""
+    """Whether an end-of-image marker is near the end (cameras append data of their own)."""
     with path.open("rb") as file:
         file.seek(max(0, path.stat().st_size - 65536))
         return b"\xff\xd9" in file.read()

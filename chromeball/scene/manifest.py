@@ -26,7 +26,7 @@ type Quad = tuple[Point, Point, Point, Point]
 type Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$")]
 
 
-class Table(Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
+class Table(Struct, forbid_unknown_fields=True, kw_only=True):
     """A table of the scene file."""
 
 
@@ -161,8 +161,10 @@ class Material(Table):
 
 
 class Object(Table):
-    """A synthetic object: ``mesh`` is sphere, box or cylinder (unit size, standing on y = 0), or a
-    mesh file; scaled, then rotated (degrees about x, y, z in turn), then moved to ``position``.
+    """A synthetic object.
+
+    ``mesh`` is sphere, box or cylinder (unit size, standing on y = 0), or a mesh file; scaled,
+    then rotated (degrees about x, y, z in turn), then moved to ``position``.
     """
 
     name: Name
@@ -243,7 +245,8 @@ class Scene(Table):
         for bracket in self.bracket:
             if bracket.name == name:
                 return bracket
-        raise UserError(f"there is no [[bracket]] named {name!r}{_nearest(name, [b.name for b in self.bracket])}")
+        near = _nearest(name, [bracket.name for bracket in self.bracket])
+        raise UserError(f"there is no [[bracket]] named {name!r}{near}")
 
 
 def read_scene(path: str | os.PathLike[str]) -> Scene:
@@ -254,6 +257,7 @@ def read_scene(path: str | os.PathLike[str]) -> Scene:
     UserError
         With the place in the file: no such file, not TOML, an unknown key (the nearest known
         one is named), a wrong type or value, a name used twice or never defined.
+
     """
     try:
         text = Path(path).read_text(encoding="utf-8")

@@ -16,7 +16,7 @@ import resource
 import sys
 import tempfile
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Generator, Iterable, Mapping
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -28,17 +28,18 @@ import numpy as np
 
 from chromeball.scene.errors import UserError
 
-type Json = None | bool | int | float | str | list[Json] | dict[str, Json]
+type Json = bool | int | float | str | list[Json] | dict[str, Json] | None
 
 
 @contextmanager
-def atomic_output(path: str | os.PathLike[str]) -> Iterator[Path]:
+def atomic_output(path: str | os.PathLike[str]) -> Generator[Path]:
     """Yield a temporary path with the suffix of `path`; rename it to `path` on success.
 
     Raises
     ------
     UserError
         If the folder cannot be made or written.
+
     """
     final = Path(path)
     try:
@@ -74,7 +75,7 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
 
 
 def write_json(path: str | os.PathLike[str], value: object) -> None:
-    """Write `value` (numbers, strings, lists, dicts, numpy arrays) as JSON, whole or not at all."""
+    """Write `value`, numpy arrays included, as JSON, whole or not at all."""
     write_text(path, json.dumps(to_json(value), indent=1, allow_nan=False) + "\n")
 
 
@@ -147,7 +148,7 @@ class Stage:
         return self
 
     @contextmanager
-    def output(self, path: str | os.PathLike[str]) -> Iterator[Path]:
+    def output(self, path: str | os.PathLike[str]) -> Generator[Path]:
         """As :func:`atomic_output`; the output gets a record when the stage ends well."""
         with atomic_output(path) as temporary:
             yield temporary
