@@ -1,0 +1,1 @@
+"""A virtual set with a known truth, photographed by emulated cameras."""
