@@ -14,7 +14,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -96,7 +96,9 @@ class CameraModel:
     # ---- constructors
 
     @classmethod
-    def pinhole(cls, size: tuple[int, int], fov: float, pose: Pose | None = None) -> Self:
+    def pinhole(
+        cls, size: tuple[int, int], fov: float, pose: Pose | None = None
+    ) -> CameraModel:
         """A perfect perspective camera; `fov` is horizontal, in radians."""
         width, height = size
         f = width / (2 * math.tan(fov / 2))
@@ -113,7 +115,7 @@ class CameraModel:
         centre: tuple[float, float] | None = None,
         radius: float | None = None,
         pose: Pose | None = None,
-    ) -> Self:
+    ) -> CameraModel:
         """A fisheye whose image circle of `radius` pixels spans `fov` radians."""
         if model not in _FISHEYE:
             raise UserError(f"unknown fisheye {model!r}; one of {', '.join(_FISHEYE)}")
@@ -124,7 +126,7 @@ class CameraModel:
         return cls(model, np.array([f, cx, cy]), size, pose or Pose.identity(), fov / 2)
 
     @classmethod
-    def latlong(cls, size: tuple[int, int], pose: Pose | None = None) -> Self:
+    def latlong(cls, size: tuple[int, int], pose: Pose | None = None) -> CameraModel:
         """A panorama; without a pose its axes are OpenEXR's in world space."""
         return cls("latlong", np.zeros(0), size, pose or WORLD_FROM_LATLONG)
 
@@ -216,7 +218,7 @@ class CameraModel:
     # ---- files, in mrcal's text format
 
     @classmethod
-    def read(cls, path: str | os.PathLike[str]) -> Self:
+    def read(cls, path: str | os.PathLike[str]) -> CameraModel:
         """Read a ``.cameramodel``; a missing or broken one is a :class:`UserError`."""
         try:
             text = Path(path).read_text()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -30,18 +29,18 @@ class Pose:
         object.__setattr__(self, "translation", t)
 
     @classmethod
-    def identity(cls) -> Self:
+    def identity(cls) -> Pose:
         """The pose that changes nothing."""
         return cls(np.eye(3), np.zeros(3))
 
     @classmethod
-    def from_matrix(cls, matrix: ArrayLike) -> Self:
+    def from_matrix(cls, matrix: ArrayLike) -> Pose:
         """From a (3, 4) or (4, 4) matrix."""
         m = np.asarray(matrix, float)
         return cls(m[:3, :3], m[:3, 3])
 
     @classmethod
-    def from_rotation_vector(cls, rotation: ArrayLike, translation: ArrayLike) -> Self:
+    def from_rotation_vector(cls, rotation: ArrayLike, translation: ArrayLike) -> Pose:
         """From an axis times angle in radians (Rodrigues) and a translation."""
         v = np.asarray(rotation, float)
         angle = float(np.linalg.norm(v))
@@ -51,7 +50,7 @@ class Pose:
         return cls(r, np.asarray(translation, float))
 
     @classmethod
-    def look_at(cls, position: ArrayLike, target: ArrayLike, up: ArrayLike = (0, 1, 0)) -> Self:
+    def look_at(cls, position: ArrayLike, target: ArrayLike, up: ArrayLike = (0, 1, 0)) -> Pose:
         """``world_from_camera`` of a camera (x right, y down, z forward) at `position`.
 
         Raises ``ValueError`` when the view direction is zero or parallel to `up`.

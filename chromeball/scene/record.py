@@ -22,7 +22,7 @@ from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
@@ -142,7 +142,7 @@ class Stage:
         self.figures: dict[str, object] = {}
         self.outputs: list[Path] = []
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> Stage:
         self._start = time.perf_counter()
         self._cpu = time.process_time()
         return self
