@@ -144,7 +144,8 @@ def photograph(folder: Path, samples: int, probe_size: int) -> None:
 
     full = radiance(empty + objects(scene, folder), view, samples)
     photograph_bracket(full, plate_times, folder / "truth/objects", rng)
-    changed = np.abs(full - plate).max(axis=2) > 0.02 * plate.max(axis=2)
+    changed = np.abs(full - plate).max(axis=2) > 0.03 * plate.max(axis=2)
+    write_picture(folder / "truth/changed.png", 255 * changed.astype(np.uint8))
     say("truth/objects_*.png, the photographs with the objects")
 
     around = CameraModel.latlong((512, 256), Pose(WORLD_FROM_LATLONG.rotation, PROBE_PLACE))
