@@ -115,6 +115,23 @@ def read_exposure(path: str | os.PathLike[str]) -> Exposure:
     return _exposure(attributes)
 
 
+def read_size(path: str | os.PathLike[str]) -> tuple[int, int]:
+    """Width and height in pixels, without reading the pixels where the format allows it."""
+    path = Path(path)
+    if not path.is_file():
+        raise UserError("no such picture", file=path)
+    if path.suffix.lower() in RAW_SUFFIXES:
+        return _read_raw(path).size
+    import OpenImageIO as oiio
+
+    source = oiio.ImageInput.open(os.fspath(path))
+    if source is None:
+        raise UserError(f"not a readable picture: {_last_line(oiio.geterror())}", file=path)
+    spec = source.spec()
+    source.close()
+    return spec.width, spec.height
+
+
 def read_rgb(path: str | os.PathLike[str]) -> NDArray[np.float32]:
     """Read a scene-linear picture as (H, W, 3) float32; grey is repeated, alpha left out.
 
