@@ -7,6 +7,7 @@ throughout. An unknown key is an error that names the nearest known one.
 from __future__ import annotations
 
 import difflib
+import math
 import os
 import re
 import tomllib
@@ -26,7 +27,7 @@ type Quad = tuple[Point, Point, Point, Point]
 type Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$")]
 
 
-class Table(Struct, forbid_unknown_fields=True, kw_only=True):
+class Table(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """A table of the scene file."""
 
 
@@ -171,8 +172,14 @@ class Object(Table):
     mesh: str
     position: Vector = (0.0, 0.0, 0.0)
     rotation: Vector = (0.0, 0.0, 0.0)
-    scale: Positive | tuple[Positive, Positive, Positive] = 1.0
+    # msgspec 0.22 corrupts memory on a bounded float beside a tuple, so bounds are checked below
+    scale: float | tuple[float, float, float] = 1.0
     material: Material = Material()
+
+    def __post_init__(self) -> None:
+        sides = self.scale if isinstance(self.scale, tuple) else (self.scale,)
+        if not all(0 < side < math.inf for side in sides):
+            raise ValueError("scale must be positive")
 
 
 class View(Table):
