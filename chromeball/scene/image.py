@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -98,38 +99,54 @@ def read_image(path: str | os.PathLike[str]) -> Image:
     )
 
 
-def read_exposure(path: str | os.PathLike[str]) -> Exposure:
-    """Read the exposure metadata alone, without the pixels."""
-    path = Path(path)
-    if not path.is_file():
-        raise UserError("no such picture", file=path)
-    import OpenImageIO as oiio
+@dataclass(frozen=True)
+class Header:
+    """What a picture says before its pixels: width and height, channels, metadata."""
 
-    source = oiio.ImageInput.open(os.fspath(path))
-    if source is None:
-        if path.suffix.lower() in RAW_SUFFIXES:
-            return _read_raw(path).exposure
-        raise UserError(f"not a readable picture: {_last_line(oiio.geterror())}", file=path)
-    attributes = {a.name: a.value for a in source.spec().extra_attribs}
-    source.close()
-    return _exposure(attributes)
+    size: tuple[int, int]
+    channels: tuple[str, ...]
+    exposure: Exposure
+    attributes: Mapping[str, Any]
 
 
-def read_size(path: str | os.PathLike[str]) -> tuple[int, int]:
-    """Width and height in pixels, without reading the pixels where the format allows it."""
+def read_header(path: str | os.PathLike[str]) -> Header:
+    """Read size, channels and metadata alone, without the pixels.
+
+    Raises
+    ------
+    UserError
+        When the file is missing or no picture.
+
+    """
     path = Path(path)
     if not path.is_file():
         raise UserError("no such picture", file=path)
     if path.suffix.lower() in RAW_SUFFIXES:
-        return _read_raw(path).size
+        with _open_raw(path) as raw:
+            size = raw.sizes.width, raw.sizes.height
+            return Header(size, ("R", "G", "B"), _raw_exposure(raw, path), {})
     import OpenImageIO as oiio
 
     source = oiio.ImageInput.open(os.fspath(path))
     if source is None:
         raise UserError(f"not a readable picture: {_last_line(oiio.geterror())}", file=path)
-    spec = source.spec()
-    source.close()
-    return spec.width, spec.height
+    try:
+        spec = source.spec()
+        size, channels = (spec.width, spec.height), tuple(spec.channelnames)
+        attributes = {a.name: a.value for a in spec.extra_attribs}
+    finally:
+        source.close()
+    return Header(size, channels, _exposure(attributes), attributes)
+
+
+def read_exposure(path: str | os.PathLike[str]) -> Exposure:
+    """Read the exposure metadata alone, without the pixels."""
+    return read_header(path).exposure
+
+
+def read_size(path: str | os.PathLike[str]) -> tuple[int, int]:
+    """Width and height in pixels, without reading the pixels."""
+    return read_header(path).size
 
 
 def read_rgb(path: str | os.PathLike[str]) -> NDArray[np.float32]:
@@ -259,34 +276,59 @@ def _write(
         raise UserError(f"cannot write: {_last_line(target.geterror())}", file=path)
 
 
-def _read_raw(path: Path) -> Image:
+@contextmanager
+def _open_raw(path: Path) -> Generator[Any]:
     import rawpy
 
     try:
         with rawpy.imread(os.fspath(path)) as raw:
-            pixels = raw.postprocess(
-                gamma=(1, 1),
-                no_auto_bright=True,
-                output_bps=16,
-                use_camera_wb=True,
-                output_color=rawpy.ColorSpace.sRGB,
-                user_flip=0,
-            )
-            other: Any = getattr(raw, "other", None)
-            exposure = Exposure(
-                time=_positive(getattr(other, "shutter", None)),
-                aperture=_positive(getattr(other, "aperture", None)),
-                iso=_positive(getattr(other, "iso_speed", None)),
-            )
+            yield raw
     except (rawpy.LibRawError, OSError) as error:
         raise UserError(f"not a readable RAW picture: {error}", file=path) from error
+
+
+def _read_raw(path: Path) -> Image:
+    import rawpy
+
+    with _open_raw(path) as raw:
+        pixels = raw.postprocess(
+            gamma=(1, 1),
+            no_auto_bright=True,
+            output_bps=16,
+            use_camera_wb=True,
+            output_color=rawpy.ColorSpace.sRGB,
+            user_flip=0,
+        )
+        exposure = _raw_exposure(raw, path)
     return Image(pixels=pixels, linear=True, channels=("R", "G", "B"), exposure=exposure)
+
+
+def _raw_exposure(raw: Any, path: Path) -> Exposure:
+    """From the EXIF where OpenImageIO reads the container (DNG and most others are TIFF).
+
+    LibRaw is asked otherwise: it makes 1 s and f/1 of metadata that is there and empty.
+    """
+    import OpenImageIO as oiio
+
+    source = oiio.ImageInput.open(os.fspath(path))
+    if source is None:
+        oiio.geterror()  # forget it: LibRaw knows more containers
+        return Exposure(
+            time=_positive(raw.other.shutter_speed),
+            aperture=_positive(raw.other.aperture),
+            iso=_positive(raw.other.iso_speed),
+        )
+    try:
+        return _exposure({a.name: a.value for a in source.spec().extra_attribs})
+    finally:
+        source.close()
 
 
 def _exposure(attributes: Mapping[str, Any]) -> Exposure:
     time = _positive(attributes.get("ExposureTime"))
-    if time is None and (apex := attributes.get("Exif:ShutterSpeedValue")) is not None:
-        time = _positive(2.0 ** -float(apex))
+    apex = attributes.get("Exif:ShutterSpeedValue")
+    if "ExposureTime" not in attributes and isinstance(apex, int | float) and abs(apex) < 64:
+        time = _positive(2.0**-apex)
     return Exposure(
         time=time,
         aperture=_positive(attributes.get("FNumber")),
@@ -301,6 +343,8 @@ def _exposure(attributes: Mapping[str, Any]) -> Exposure:
 
 
 def _positive(value: Any) -> float | None:
+    if isinstance(value, tuple) and value:
+        value = value[0]
     if isinstance(value, int | float | np.number) and math.isfinite(value) and value > 0:
         return float(value)  # pyright: ignore[reportArgumentType]
     return None

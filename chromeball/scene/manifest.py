@@ -135,6 +135,8 @@ class StandIn(Table):
     ``room``: a polygon raised to ``height`` and seen from inside.
     Corners are ``points``, pixels in env.exr, or ``corners``, (x, z) in metres on the floor;
     ``height`` in metres, or ``height_point``, the pixel above the first corner.
+    ``outline`` says how they draw the base: a polygon by its corners, a square by its diagonal
+    (2), a rectangle by one side and a point of the opposite side (3), a circle by three points.
     ``surface``: support receives shadows and light of the objects, environment only emits.
     For a room the floor is ``surface`` and walls and ceiling are environment.
     """
@@ -143,6 +145,7 @@ class StandIn(Table):
     kind: Literal["plane", "polygon", "box", "room"]
     points: list[Point] = []
     corners: list[Point] = []
+    outline: Literal["polygon", "square", "rectangle", "circle"] = "polygon"
     size: tuple[Positive, Positive] | None = None
     height: Positive | None = None
     height_point: Point | None = None
