@@ -31,7 +31,7 @@ class Table(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """A table of the scene file."""
 
 
-class Emulate(Table):
+class Emulate(Table, frozen=True):
     """A virtual camera on a pseudo-terminal, in place of a device.
 
     ``radiance``: the EXR that stands before its lens. ``standard``: video system.
@@ -41,7 +41,7 @@ class Emulate(Table):
     seed: int = 0
 
 
-class Bracket(Table):
+class Bracket(Table, frozen=True):
     """One exposure bracket: a take of a device, or photographs that lie in a folder.
 
     ``frames`` are paths or patterns; ``times`` their exposure times (seconds or "1/30") where
@@ -58,7 +58,7 @@ class Bracket(Table):
     emulate: Emulate | None = None
 
 
-class Hdr(Table):
+class Hdr(Table, frozen=True):
     """Response and merge. ``response``: a stored curve; else it is solved from ``solve_from``.
 
     ``smoothness`` is Debevec and Malik's lambda.
@@ -69,7 +69,7 @@ class Hdr(Table):
     smoothness: Positive | None = None
 
 
-class Lens(Table):
+class Lens(Table, frozen=True):
     """An ideal fisheye: ``fov`` across the image circle of ``radius`` pixels at ``centre``."""
 
     model: Literal["equidistant", "equisolid", "stereographic", "orthographic"]
@@ -78,7 +78,7 @@ class Lens(Table):
     centre: Point | None = None
 
 
-class Shot(Table):
+class Shot(Table, frozen=True):
     """One direction of the light probe: its bracket and its turn about the vertical."""
 
     bracket: Name
@@ -87,7 +87,7 @@ class Shot(Table):
     roll: float = 0.0
 
 
-class Probe(Table):
+class Probe(Table, frozen=True):
     """The light probe: shots with one lens, a model of it or a ``camera`` file.
 
     ``vignetting``: c1, c2, ... of the fall-off 1 + c1 r^2 + c2 r^4 + ..., r = 1 at the rim of
@@ -100,7 +100,7 @@ class Probe(Table):
     vignetting: list[float] = []
 
 
-class Align(Table):
+class Align(Table, frozen=True):
     """World axes and scale from the four corners of a rectangle on the floor.
 
     ``picture``: the name of the probe shot's bracket that the points were clicked in, or
@@ -116,7 +116,7 @@ class Align(Table):
     camera_height: Positive | None = None
 
 
-class Env(Table):
+class Env(Table, frozen=True):
     """The lat-long map. ``file``: a finished panorama, so that nothing is stitched.
 
     ``lights``: how many light samples `envmap lights` writes.
@@ -127,7 +127,7 @@ class Env(Table):
     lights: Annotated[int, Meta(ge=1, le=65536)] = 64
 
 
-class StandIn(Table):
+class StandIn(Table, frozen=True):
     """One piece of stand-in geometry.
 
     ``plane``: a rectangle of ``size`` metres on the floor about the world's origin.
@@ -152,7 +152,7 @@ class StandIn(Table):
     surface: Literal["support", "environment"] = "support"
 
 
-class Material(Table):
+class Material(Table, frozen=True):
     """``color``: albedo of diffuse, reflectance of mirror, transmittance of glass."""
 
     kind: Literal["diffuse", "mirror", "glass"] = "diffuse"
@@ -164,7 +164,7 @@ class Material(Table):
     ior: Annotated[float, Meta(ge=1, le=4)] = 1.5
 
 
-class Object(Table):
+class Object(Table, frozen=True):
     """A synthetic object.
 
     ``mesh`` is sphere, box or cylinder (unit size, standing on y = 0), or a mesh file; scaled,
@@ -185,7 +185,7 @@ class Object(Table):
             raise ValueError("scale must be positive")
 
 
-class View(Table):
+class View(Table, frozen=True):
     """A picture to make.
 
     With ``bracket`` or ``plate`` (a radiance EXR) a photograph is the background; its camera is
@@ -209,7 +209,7 @@ class View(Table):
     exposure: Positive | None = None
 
 
-class Calibrate(Table):
+class Calibrate(Table, frozen=True):
     """The view camera: photographs of a target, or a finished ``camera``."""
 
     images: list[str] = []
@@ -218,7 +218,7 @@ class Calibrate(Table):
     camera: str | None = None
 
 
-class Render(Table):
+class Render(Table, frozen=True):
     """How the objects are rendered into the views."""
 
     spp: Annotated[int, Meta(ge=1)] = 64
@@ -227,13 +227,13 @@ class Render(Table):
     composite: Literal["quotient", "difference"] = "quotient"
 
 
-class Truth(Table):
+class Truth(Table, frozen=True):
     """What an example knows about itself. Only the report reads it."""
 
     folder: str
 
 
-class Scene(Table):
+class Scene(Table, frozen=True):
     """A whole scene file. ``folder`` holds what the stages make."""
 
     name: str
@@ -287,6 +287,7 @@ def parse_scene(text: str, path: str | os.PathLike[str] = "scene.toml") -> Scene
     try:
         scene = msgspec.convert(value, Scene)
         _check_names(scene)
+        _check_numbers(scene)
     except msgspec.ValidationError as error:
         raise UserError(_explain(str(error)), file=path) from error
     except UserError as error:
@@ -324,6 +325,27 @@ def _check_names(scene: Scene) -> None:
     for bracket in scene.bracket:
         for time in bracket.times:
             parse_time(time)
+
+
+def _check_numbers(scene: Scene) -> None:
+    """TOML knows inf and nan, and bounds let them pass."""
+    where = _not_finite(msgspec.to_builtins(scene), "")
+    if where is not None:
+        raise UserError(f"{where.lstrip('.')} is not a finite number")
+
+
+def _not_finite(value: object, where: str) -> str | None:
+    """Where in nested tables and lists a number is infinite or NaN, or None."""
+    match value:
+        case float():
+            return None if math.isfinite(value) else where
+        case dict():
+            places = [_not_finite(v, f"{where}.{key}") for key, v in value.items()]
+        case list() | tuple():
+            places = [_not_finite(v, f"{where}[{i}]") for i, v in enumerate(value)]
+        case _:
+            return None
+    return next((place for place in places if place is not None), None)
 
 
 def _explain(message: str) -> str:
