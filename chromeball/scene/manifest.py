@@ -175,7 +175,7 @@ class Object(Table, frozen=True):
     mesh: str
     position: Vector = (0.0, 0.0, 0.0)
     rotation: Vector = (0.0, 0.0, 0.0)
-    # msgspec 0.22 corrupts memory on a bounded float beside a tuple, so bounds are checked below
+    # msgspec 0.22 corrupts memory on a bounded float beside a tuple: bounds are checked below
     scale: float | tuple[float, float, float] = 1.0
     material: Material = Material()
 

@@ -23,6 +23,7 @@ def mesh(vertices: int = 5, faces: int = 4, seed: int = 0) -> StandInMesh:
     )
 
 
+@settings(deadline=None)
 @given(st.integers(3, 40), st.integers(1, 60), st.integers(0, 2**32 - 1))
 def test_round_trip_is_exact(
     tmp_path_factory: pytest.TempPathFactory, vertices: int, faces: int, seed: int
@@ -133,7 +134,7 @@ def test_no_file_and_no_faces(tmp_path: Path) -> None:
         )
 
 
-@settings(max_examples=300)
+@settings(max_examples=300, deadline=None)
 @given(st.data())
 def test_any_bytes_give_a_mesh_or_one_line(
     tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
