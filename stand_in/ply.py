@@ -1,8 +1,8 @@
 """``stand_in.ply``: triangles in metres, a class per face, the captured place per vertex.
 
 The layout is fixed, so that reading is one check of the header and two views of the bytes:
-binary little endian, vertices with x y z and wx wy wz (P. Debevec's stand-in geometry with the
-environment coordinates of seeds row F8), triangles with ``surface`` 0 support, 1 environment.
+binary little endian, vertices with x y z and wx wy wz (the environment coordinates of Felinto,
+Zang and Velho, section 6.4; seeds F8), triangles with ``surface`` 0 support, 1 environment.
 """
 
 from __future__ import annotations
