@@ -1,0 +1,640 @@
+"""What a scene needs: every stage with its reason, files, command and slice of the scene file.
+
+Whether a needed stage is up to date is another question: see `freshness`.
+"""
+
+from __future__ import annotations
+
+import glob
+import json
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from chromeball.scene.errors import UserError
+from chromeball.scene.manifest import Bracket, Lens, Quad, Scene, View
+
+# the suffixes of `chromeball.scene.image`, which is too heavy to import for a plan
+LINEAR_SUFFIXES = frozenset(
+    {".exr", ".hdr", ".pfm", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"}
+    | {".pef", ".srw"}
+)
+REPORT = "report.html"
+
+
+@dataclass(frozen=True)
+class StagePlan:
+    """One stage of a scene; all paths are relative to the scene file's folder.
+
+    ``name`` is the record's stage, followed by the bracket or view where there are several.
+    ``reason`` says why the scene needs it, or why not. ``slice`` holds just what of the scene
+    file and of the command line the stage depends on. A stage that is not needed has no
+    files and no command. ``after``: outputs that must not be made at the same time.
+    """
+
+    name: str
+    needed: bool
+    reason: str
+    inputs: tuple[str, ...] = ()
+    outputs: tuple[str, ...] = ()
+    command: tuple[str, ...] = ()
+    slice: dict[str, Any] | None = None
+    after: tuple[str, ...] = ()
+
+    def slice_file(self, folder: str) -> str:
+        """Where the slice is kept, in the scene's `folder` of made files."""
+        return f"{folder}/slices/{self.name.replace(' ', '-')}.json"
+
+    def slice_text(self) -> str:
+        """The slice as canonical JSON: the same content is the same text."""
+        value = {"command": self.command, "scene": msgspec.to_builtins(self.slice)}
+        return json.dumps(value, indent=1, sort_keys=True, ensure_ascii=False) + "\n"
+
+
+def stages(scene: Scene, path: Path) -> list[StagePlan]:
+    """Every stage of a scene, in the order of the pipeline; `path` is the scene file.
+
+    Writes nothing; reads folders to expand patterns, and the ``take.json`` of finished takes
+    to see whether their frames are linear.
+
+    Raises
+    ------
+    UserError
+        Where the scene lacks what a needed stage wants, or two stages would write one file.
+
+    """
+    try:
+        plan = _Planner(scene, path).plan()
+    except UserError as error:
+        raise UserError(error.what, file=error.file or path) from error
+    makers: dict[str, str] = {}
+    for stage in plan:
+        for output in stage.outputs:
+            if output in makers:
+                raise UserError(
+                    f"{makers[output]} and {stage.name} would both write {output}; rename one",
+                    file=path,
+                )
+            makers[output] = stage.name
+    return plan
+
+
+def patterns(scene: Scene) -> list[str]:
+    """The picture patterns with wildcards, whose matches may change without the scene."""
+    names = [frame for bracket in scene.bracket for frame in bracket.frames]
+    if scene.calibrate:
+        names += scene.calibrate.images
+    return [name for name in names if glob.has_magic(name)]
+
+
+class _Planner:
+    """The decisions of one plan, stage by stage in the order of the pipeline."""
+
+    def __init__(self, scene: Scene, path: Path) -> None:
+        self.scene = scene
+        self.file = path.name
+        self.root = path.parent
+        self.build = scene.folder.rstrip("/")
+        self.frames: dict[str, list[str]] = {}
+        self.linear: dict[str, bool] = {}
+        self.rendered = scene.view if scene.object else []
+        self.plates = [view for view in self.rendered if view.bracket or view.plate]
+        self.shots = [] if scene.env.file or not scene.probe else scene.probe.shot
+
+    def plan(self) -> list[StagePlan]:
+        scene = self.scene
+        self._check()
+        plan: list[StagePlan] = []
+        for bracket in scene.bracket:
+            plan.append(self._take(bracket, plan))
+        plan.append(self._response())
+        plan += [self._merge(bracket) for bracket in scene.bracket]
+        plan += [self._lens(), self._align(), self._probe(), self._lights()]
+        plan += [self._pose(view) for view in scene.view]
+        plan += self._stand_in()
+        plan += [self._render(view) for view in scene.view]
+        plan.append(self._report(plan))
+        return plan
+
+    # ---- what the scene must hold
+
+    def _check(self) -> None:
+        scene = self.scene
+        if not re.fullmatch(r"[\w./+,@-]+", self.build) or self.build.startswith("-"):
+            raise UserError(f"folder {scene.folder!r}: use letters, digits and _ . - / alone")
+        if Path(self.build).is_absolute() or ".." in Path(self.build).parts:
+            raise UserError(f"folder {scene.folder!r} must lie within the scene's own folder")
+        if self.rendered and not (scene.env.file or scene.probe):
+            raise UserError("nothing lights the objects: add a [probe], or env.file")
+        if scene.probe and not scene.env.file:
+            if not scene.probe.shot:
+                raise UserError("[probe] has no shot")
+            if (scene.probe.lens is None) == (scene.probe.camera is None):
+                raise UserError("[probe] needs a lens or a camera, one of the two")
+        if scene.align:
+            shots = [shot.bracket for shot in self.shots]
+            known = ["env"] if scene.env.file else shots
+            if scene.align.picture not in known:
+                raise UserError(
+                    f"align.picture {scene.align.picture!r} is not where the light was seen; "
+                    f"known: {', '.join(known) or 'none'}"
+                )
+        for view in scene.view:
+            if view.bracket and view.plate:
+                raise UserError(f"view {view.name!r} has a bracket and a plate; keep one")
+            if view.points and not (view.bracket or view.plate):
+                raise UserError(f"view {view.name!r} has points but no photograph")
+        for view in self.plates:
+            if view.points and not scene.align:
+                raise UserError(f"view {view.name!r} has points but there is no [align]")
+            if not view.points and not view.camera:
+                raise UserError(
+                    f"view {view.name!r} has a photograph but nothing says from where: give "
+                    "its points, or a camera file that holds the pose"
+                )
+            if not view.camera and not scene.calibrate:
+                raise UserError(
+                    f"view {view.name!r} has a photograph but no camera: give it one, or add "
+                    "[calibrate]"
+                )
+
+    # ---- photographs
+
+    def _users(self, bracket: Bracket) -> list[str]:
+        """Who reads the radiance of a bracket."""
+        users = ["the light probe" for shot in self.shots if shot.bracket == bracket.name]
+        users += [f"view {view.name}" for view in self.rendered if view.bracket == bracket.name]
+        if not self.scene.probe and not self.scene.view:
+            users.append("radiance is all this scene asks for")
+        return list(dict.fromkeys(users))
+
+    def _expanded(self, bracket: Bracket) -> list[str]:
+        if bracket.name not in self.frames:
+            self.frames[bracket.name] = _expand(
+                bracket.frames, self.root, f"bracket {bracket.name!r}"
+            )
+        return self.frames[bracket.name]
+
+    def _folder_of(self, bracket: Bracket) -> str:
+        return (bracket.take or f"takes/{bracket.name}").rstrip("/")
+
+    def _is_linear(self, bracket: Bracket) -> bool:
+        if bracket.name in self.linear:
+            return self.linear[bracket.name]
+        if bracket.device or bracket.emulate:
+            names = []
+        elif bracket.frames:
+            names = self._expanded(bracket)
+        else:
+            names = _frames_of_take(self.root / self._folder_of(bracket) / "take.json")
+        kinds = {Path(name).suffix.lower() in LINEAR_SUFFIXES for name in names}
+        if len(kinds) > 1:
+            raise UserError(f"bracket {bracket.name!r} mixes linear frames with others")
+        self.linear[bracket.name] = kinds == {True}
+        return self.linear[bracket.name]
+
+    def _take(self, bracket: Bracket, before: Sequence[StagePlan]) -> StagePlan:
+        name = f"take {bracket.name}"
+        take = self._folder_of(bracket)
+        users = self._users(bracket)
+        if self._solves(bracket):
+            users.append("the response curve")
+        if not users:
+            return StagePlan(name, False, "no shot and no view uses it")
+        sources = [bool(bracket.frames), bool(bracket.device or bracket.emulate)]
+        if sources == [True, True]:
+            raise UserError(f"bracket {bracket.name!r} has frames and a device; keep one")
+        if sources == [False, False]:
+            if not bracket.take:
+                raise UserError(f"bracket {bracket.name!r} needs frames, a take or a device")
+            return StagePlan(name, False, f"{take} is a finished take")
+        if bracket.frames:
+            return self._import(bracket, name, take, users)
+        if not bracket.times:
+            raise UserError(f"bracket {bracket.name!r} needs the times to expose for")
+        if bracket.emulate:
+            device = bracket.device or f"visca:{self.build}/dev/{bracket.name}"
+            video = bracket.video or f"socket:{self.build}/dev/{bracket.name}.sock"
+        elif bracket.device and bracket.video:
+            device, video = bracket.device, bracket.video
+        else:
+            raise UserError(f"bracket {bracket.name!r} has a device but no video")
+        command = (
+            *("chromeball", "acquire", "bracket"),
+            *_option("device", device),
+            *_option("video", video),
+            *_option("times", ",".join(map(str, bracket.times))),
+            *("-o", take),
+        )
+        inputs: tuple[str, ...] = ()
+        after: tuple[str, ...] = ()
+        if bracket.emulate:
+            inputs = (bracket.emulate.radiance,)
+            prefix = (
+                *("chromeball", "emulate", "visca"),
+                *_option("radiance", bracket.emulate.radiance),
+                *_option("link", device.partition(":")[2]),
+                *_option("video", video),
+                *_option("seed", str(bracket.emulate.seed)),
+            )
+            command = (*prefix, "--", *command)
+        else:
+            # one device takes one bracket at a time, under `make -j` too
+            after = tuple(
+                output
+                for stage in before
+                if {device, video} & set(stage.command)
+                for output in stage.outputs
+            )
+        return StagePlan(
+            name,
+            True,
+            f"{len(bracket.times)} exposures of {device} for {', '.join(users)}",
+            inputs,
+            (f"{take}/take.json",),
+            command,
+            {},
+            after,
+        )
+
+    def _import(self, bracket: Bracket, name: str, take: str, users: list[str]) -> StagePlan:
+        frames = self._expanded(bracket)
+        if bracket.times and len(bracket.times) != len(frames):
+            raise UserError(
+                f"bracket {bracket.name!r} has {len(frames)} frames "
+                f"but {len(bracket.times)} times"
+            )
+        times = _option("times", ",".join(map(str, bracket.times))) if bracket.times else ()
+        return StagePlan(
+            name,
+            True,
+            f"{len(frames)} photographs for {', '.join(users)}",
+            tuple(frames),
+            (f"{take}/take.json",),
+            ("chromeball", "acquire", "import", *map(_plain, frames), *times, "-o", take),
+            {},
+        )
+
+    # ---- radiance
+
+    def _coded(self) -> list[Bracket]:
+        """Brackets in use whose frames need a response curve."""
+        return [b for b in self.scene.bracket if self._users(b) and not self._is_linear(b)]
+
+    def _solving(self) -> list[Bracket]:
+        """The brackets that the response curve is solved from."""
+        if self.scene.hdr.response or not self._coded():
+            return []
+        named = [self.scene.find_bracket(name) for name in self.scene.hdr.solve_from]
+        for bracket in named:
+            if self._is_linear(bracket):
+                raise UserError(
+                    f"hdr.solve_from: the frames of {bracket.name!r} are linear and say "
+                    "nothing of a response curve"
+                )
+        probe = {shot.bracket for shot in self.shots}
+        coded = self._coded()
+        return named or [b for b in coded if b.name in probe][:1] or coded[:1]
+
+    def _solves(self, bracket: Bracket) -> bool:
+        return any(bracket.name == other.name for other in self._solving())
+
+    def _response(self) -> StagePlan:
+        name = "hdr response"
+        if self.scene.hdr.response:
+            return StagePlan(name, False, f"{self.scene.hdr.response} is given")
+        brackets = self._solving()
+        if not brackets:
+            any_used = any(self._users(bracket) for bracket in self.scene.bracket)
+            return StagePlan(
+                name, False, "all frames are linear" if any_used else "no bracket is in use"
+            )
+        takes = [self._folder_of(bracket) for bracket in brackets]
+        smoothness = self.scene.hdr.smoothness
+        output = f"{self.build}/response.json"
+        return StagePlan(
+            name,
+            True,
+            f"the frames of {', '.join(b.name for b in self._coded())} are not linear",
+            tuple(f"{take}/take.json" for take in takes),
+            (output,),
+            (
+                *("chromeball", "hdr", "response", *takes),
+                *(_option("smoothness", f"{smoothness:.10g}") if smoothness else ()),
+                *("-o", output),
+            ),
+            {},
+        )
+
+    def _merge(self, bracket: Bracket) -> StagePlan:
+        name = f"hdr merge {bracket.name}"
+        users = self._users(bracket)
+        if not users:
+            used = "only the response curve is solved from it"
+            return StagePlan(
+                name, False, used if self._solves(bracket) else "no shot and no view uses it"
+            )
+        take = self._folder_of(bracket)
+        output = f"{self.build}/{bracket.name}.exr"
+        inputs, curve = [f"{take}/take.json"], ()
+        if not self._is_linear(bracket):
+            response = self.scene.hdr.response or f"{self.build}/response.json"
+            inputs.append(response)
+            curve = _option("response", response)
+        return StagePlan(
+            name,
+            True,
+            f"radiance for {', '.join(users)}",
+            tuple(inputs),
+            (output,),
+            ("chromeball", "hdr", "merge", take, *curve, "-o", output),
+            {},
+        )
+
+    # ---- cameras and the world
+
+    def _lens(self) -> StagePlan:
+        name = "calibrate lens"
+        calibrate = self.scene.calibrate
+        if calibrate is None:
+            return StagePlan(name, False, "the scene has no [calibrate]")
+        if calibrate.camera:
+            return StagePlan(name, False, f"{calibrate.camera} is a finished camera")
+        if not self.plates:
+            return StagePlan(name, False, "no view has a photograph behind it")
+        if all(view.camera for view in self.plates):
+            return StagePlan(name, False, "every view names its own camera")
+        if not calibrate.images or not calibrate.target:
+            raise UserError("[calibrate] needs images and a target, or a finished camera")
+        images = _expand(calibrate.images, self.root, "calibrate.images")
+        output = f"{self.build}/lens.cameramodel"
+        return StagePlan(
+            name,
+            True,
+            "the lens of "
+            + ", ".join(f"view {view.name}" for view in self.plates if not view.camera),
+            tuple(images),
+            (output,),
+            (
+                *("chromeball", "calibrate", "lens", *map(_plain, images)),
+                *_option("target", calibrate.target),
+                *_option("model", calibrate.model),
+                *("-o", output),
+            ),
+            {},
+        )
+
+    def _camera_of(self, view: View) -> str:
+        calibrate = self.scene.calibrate
+        return (
+            view.camera
+            or (calibrate.camera if calibrate else None)
+            or f"{self.build}/lens.cameramodel"
+        )
+
+    def _env(self) -> str:
+        return self.scene.env.file or f"{self.build}/env.exr"
+
+    def _align(self) -> StagePlan:
+        name = "envmap align"
+        align, probe = self.scene.align, self.scene.probe
+        if align is None:
+            return StagePlan(name, False, "no [align]: the first shot's axes are the world's")
+        picture = (
+            self._env() if align.picture == "env" else f"{self.build}/{align.picture}.exr"
+        )
+        inputs = [picture]
+        if probe and probe.camera and align.picture != "env":
+            inputs.append(probe.camera)
+        clicked = {
+            "lens": probe and probe.lens,
+            "camera": probe and probe.camera,
+            "shot": [shot for shot in self.shots if shot.bracket == align.picture],
+        }
+        output = f"{self.build}/align.json"
+        return StagePlan(
+            name,
+            True,
+            f"world axes and scale from four points of {align.picture}",
+            tuple(inputs),
+            (output,),
+            ("chromeball", "envmap", "align", self.file, "-o", output),
+            {"align": align, "probe": clicked},
+        )
+
+    def _probe(self) -> StagePlan:
+        name = "envmap probe"
+        scene, probe = self.scene, self.scene.probe
+        if scene.env.file:
+            return StagePlan(name, False, f"{scene.env.file} is a finished panorama")
+        if probe is None:
+            return StagePlan(name, False, "no [probe]")
+        merged = [f"{self.build}/{shot.bracket}.exr" for shot in probe.shot]
+        inputs = list(merged)
+        options: list[str] = []
+        for axis in ("yaw", "pitch", "roll"):
+            angles = [float(getattr(shot, axis)) for shot in probe.shot]
+            if axis == "yaw" or any(angles):
+                options += _option(axis, ",".join(f"{angle:.10g}" for angle in angles))
+        if probe.camera:
+            options += _option("camera", probe.camera)
+            inputs.append(probe.camera)
+        elif probe.lens:
+            options += _option("lens", lens_text(probe.lens))
+        if probe.vignetting:
+            options += _option("vignetting", ",".join(f"{c:.17g}" for c in probe.vignetting))
+        if scene.align:
+            options += _option("align", f"{self.build}/align.json")
+            inputs.append(f"{self.build}/align.json")
+        output = f"{self.build}/env.exr"
+        return StagePlan(
+            name,
+            True,
+            f"{len(merged)} shot{'s' if len(merged) > 1 else ''} of the light probe",
+            tuple(inputs),
+            (output,),
+            (
+                *("chromeball", "envmap", "probe", *merged, *options),
+                *("--width", str(scene.env.width), "-o", output),
+            ),
+            {},
+        )
+
+    def _lights(self) -> StagePlan:
+        name = "envmap lights"
+        if not (self.scene.env.file or self.scene.probe):
+            return StagePlan(name, False, "no environment map")
+        output = f"{self.build}/lights.json"
+        count = str(self.scene.env.lights)
+        return StagePlan(
+            name,
+            True,
+            "a by-product for other renderers; ours samples the map itself",
+            (self._env(),),
+            (output,),
+            ("chromeball", "envmap", "lights", self._env(), "--count", count, "-o", output),
+            {},
+        )
+
+    def _pose(self, view: View) -> StagePlan:
+        name = f"calibrate pose {view.name}"
+        if view not in self.plates:
+            has = view.bracket or view.plate
+            return StagePlan(
+                name, False, "nothing to render" if has else "no photograph behind the view"
+            )
+        if not view.points:
+            return StagePlan(name, False, f"{view.camera} holds the pose")
+        camera, align = self._camera_of(view), f"{self.build}/align.json"
+        output = f"{self.build}/{view.name}.cameramodel"
+        return StagePlan(
+            name,
+            True,
+            "where the photograph was taken from, by four points",
+            (camera, align),
+            (output,),
+            (
+                *("chromeball", "calibrate", "pose", *_option("camera", camera)),
+                *_option("points", points_text(view.points)),
+                *_option("align", align),
+                *("-o", output),
+            ),
+            {},
+        )
+
+    # ---- geometry and pictures
+
+    def _stand_in(self) -> Iterator[StagePlan]:
+        names = ("stand-in build", "stand-in depth")
+        if not self.scene.stand_in or not (self.scene.env.file or self.scene.probe):
+            why = "no environment map" if self.scene.stand_in else "no [[stand_in]]"
+            for name in names:
+                yield StagePlan(name, False, why)
+            return
+        mesh, depth = f"{self.build}/stand_in.ply", f"{self.build}/env_depth.exr"
+        env = self._env()
+        yield StagePlan(
+            names[0],
+            True,
+            f"{len(self.scene.stand_in)} drawn on the panorama",
+            (env,),
+            (mesh,),
+            ("chromeball", "stand-in", "build", self.file, "--env", env, "-o", mesh),
+            {"stand_in": self.scene.stand_in},
+        )
+        yield StagePlan(
+            names[1],
+            True,
+            "how far away the light comes from",
+            (mesh, env),
+            (depth,),
+            ("chromeball", "stand-in", "depth", mesh, "--env", env, "-o", depth),
+            {},
+        )
+
+    def _render(self, view: View) -> StagePlan:
+        name = f"render {view.name}"
+        scene = self.scene
+        if not scene.object:
+            return StagePlan(name, False, "no [[object]]")
+        inputs = [self._env()]
+        if scene.stand_in:
+            inputs += [f"{self.build}/stand_in.ply", f"{self.build}/env_depth.exr"]
+        if view.bracket:
+            inputs.append(f"{self.build}/{view.bracket}.exr")
+        if view.plate:
+            inputs.append(view.plate)
+        if view.points and view in self.plates:
+            inputs.append(f"{self.build}/{view.name}.cameramodel")
+        elif view.camera:
+            inputs.append(view.camera)
+        inputs += [o.mesh for o in scene.object if o.mesh not in ("sphere", "box", "cylinder")]
+        picture = f"{self.build}/{view.name}.exr"
+        count = len(scene.object)
+        return StagePlan(
+            name,
+            True,
+            f"{count} object{'s' if count > 1 else ''} at {scene.render.spp} samples a pixel",
+            tuple(dict.fromkeys(inputs)),
+            (picture, f"{self.build}/{view.name}.png"),
+            ("chromeball", "render", self.file, *_option("view", view.name), "-o", picture),
+            {"object": scene.object, "render": scene.render, "view": view},
+        )
+
+    def _report(self, plan: Sequence[StagePlan]) -> StagePlan:
+        outputs = [output for stage in plan for output in stage.outputs]
+        return StagePlan(
+            "report",
+            bool(outputs),
+            "what was done, and how well" if outputs else "nothing is made",
+            tuple(outputs),
+            (REPORT,) if outputs else (),
+            ("chromeball", "report", self.file, "-o", REPORT) if outputs else (),
+            {
+                "name": self.scene.name,
+                "stages": [[s.name, s.needed, s.reason] for s in plan],
+                "truth": self.scene.truth,
+            },
+        )
+
+
+def lens_text(lens: Lens) -> str:
+    """``equisolid:190``, or ``equisolid:186:2825,1863.5,1806`` with centre and radius."""
+    text = f"{lens.model}:{lens.fov:.10g}"
+    if lens.radius is None and lens.centre is None:
+        return text
+    centre = "," if lens.centre is None else ",".join(f"{v:.10g}" for v in lens.centre)
+    radius = "" if lens.radius is None else f"{lens.radius:.10g}"
+    return f"{text}:{centre},{radius}"
+
+
+def points_text(points: Quad) -> str:
+    """``"x,y x,y x,y x,y"``."""
+    return " ".join(f"{x:.10g},{y:.10g}" for x, y in points)
+
+
+def _option(name: str, value: str) -> tuple[str, ...]:
+    """``--name value``; a value that begins with a minus sign is tied to its name."""
+    return (f"--{name}={value}",) if value.startswith("-") else (f"--{name}", value)
+
+
+def _plain(name: str) -> str:
+    """A file name that no command takes for an option."""
+    return f"./{name}" if name.startswith("-") else name
+
+
+def _expand(names: Sequence[str], root: Path, where: str) -> list[str]:
+    """Files for names and patterns, patterns sorted; a plain name need not exist yet."""
+    found: list[str] = []
+    for name in names:
+        if not glob.has_magic(name) or (root / name).exists():
+            found.append(name)
+            continue
+        matches = sorted(glob.glob(name, root_dir=root, recursive=True))
+        if not matches:
+            raise UserError(
+                f"{where}: no picture matches {name!r}; if a rule of the Makefile makes them, "
+                "name them one by one, or let pipeline.mk wait for them (pipeline.mk: | FILES)"
+            )
+        found += matches
+    if not found:
+        raise UserError(f"{where} names no picture")
+    twice = [name for name in found if found.count(name) > 1]
+    if twice:
+        raise UserError(f"{where} names {twice[0]!r} twice")
+    return found
+
+
+def _frames_of_take(path: Path) -> list[str]:
+    """The frames that a finished take lists; none where the take does not stand there yet."""
+    if not path.exists():
+        return []
+    try:
+        value = msgspec.json.decode(path.read_bytes())
+        return [frame["file"] for frame in value["frames"]]
+    except (OSError, msgspec.DecodeError, KeyError, TypeError) as error:
+        raise UserError("not a readable take", file=path) from error
