@@ -21,7 +21,7 @@ class Verdict:
 
 
 def judge(plan: Sequence[StagePlan], root: Path, folder: str) -> list[Verdict]:
-    """Apply make's rule to every stage of `plan`: is an output older than an input or gone?
+    """Apply make's rule to every stage: an output that is gone, or older than an input.
 
     `root` is the folder of the scene file, `folder` its ``scene.folder``.
     """
@@ -98,5 +98,3 @@ def _first_difference(old: Any, new: Any, place: str) -> str | None:
             if found is not None:
                 return found if isinstance(b, dict) else place
     return place
-
-

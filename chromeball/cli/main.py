@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import os
 import sys
 from typing import TYPE_CHECKING
@@ -71,6 +72,10 @@ def main() -> None:
                 from importlib.metadata import version
 
                 print(version("chromeball"))
+            case [name, *_] if not name.startswith("-") and name not in {**COMMANDS, **GROUPS}:
+                close = difflib.get_close_matches(name, [*COMMANDS, *GROUPS], n=1)
+                near = f"; did you mean {close[0]!r}?" if close else "; see chromeball --help"
+                raise UserError(f"there is no command {name!r}{near}")
             case arguments:
                 _run(arguments)
         sys.stdout.flush()

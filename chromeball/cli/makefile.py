@@ -30,9 +30,9 @@ def pipeline(plan: Sequence[StagePlan], scene: Scene, path: Path) -> str:
         folders = [_name(folder) for folder in watched if _is_quiet(folder, plan)]
     except UserError as error:
         raise UserError(error.what, file=path) from error
-    skipped = [f"#   {stage.name}: {stage.reason}" for stage in plan if not stage.needed]
+    skipped = [_comment(f"  {s.name}: {s.reason}") for s in plan if not s.needed]
     header = [
-        f"# Written by `chromeball plan {shlex.quote(path.name)} --makefile`; not to be edited.",
+        _comment(f"Written by `chromeball plan {path.name} --makefile`; not to be edited."),
         *(["# Skipped:", *skipped] if skipped else []),
         ".PHONY: all",
         _wrap("all:", [_name(o) for s in plan[-1:] for o in s.outputs]),
@@ -66,13 +66,19 @@ def _rule(stage: StagePlan, folder: str) -> str:
     after = ["|", *map(_name, stage.after)] if stage.after else []
     command = shlex.join(stage.command)
     if re.search(r"[\x00-\x1f\x7f]", command):
-        raise UserError(f"{stage.name}: a name or value holds a control character")
+        raise UserError(f"{stage.name}: a value holds a control character; rename the file")
     return (
-        f"# {stage.name}: {stage.reason}\n"
+        _comment(f"{stage.name}: {stage.reason}")
+        + "\n"
         + _wrap(targets + colon, [*map(_name, needs), *after])
         + "\n\t"
         + command.replace("$", "$$")
     )
+
+
+def _comment(text: str) -> str:
+    """One line of comment; a backslash would continue it."""
+    return "# " + re.sub(r"[\x00-\x1f\x7f\\]", "?", text)
 
 
 def _wrap(head: str, names: Iterable[str]) -> str:

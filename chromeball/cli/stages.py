@@ -340,7 +340,8 @@ class _Planner:
             )
         take = self._folder_of(bracket)
         output = f"{self.build}/{bracket.name}.exr"
-        inputs, curve = [f"{take}/take.json"], ()
+        inputs = [f"{take}/take.json"]
+        curve: tuple[str, ...] = ()
         if not self._is_linear(bracket):
             response = self.scene.hdr.response or f"{self.build}/response.json"
             inputs.append(response)
@@ -404,9 +405,7 @@ class _Planner:
         align, probe = self.scene.align, self.scene.probe
         if align is None:
             return StagePlan(name, False, "no [align]: the first shot's axes are the world's")
-        picture = (
-            self._env() if align.picture == "env" else f"{self.build}/{align.picture}.exr"
-        )
+        picture = self._env() if align.picture == "env" else f"{self.build}/{align.picture}.exr"
         inputs = [picture]
         if probe and probe.camera and align.picture != "env":
             inputs.append(probe.camera)
@@ -446,7 +445,7 @@ class _Planner:
         elif probe.lens:
             options += _option("lens", lens_text(probe.lens))
         if probe.vignetting:
-            options += _option("vignetting", ",".join(f"{c:.17g}" for c in probe.vignetting))
+            options += _option("vignetting", ",".join(repr(c) for c in probe.vignetting))
         if scene.align:
             options += _option("align", f"{self.build}/align.json")
             inputs.append(f"{self.build}/align.json")

@@ -60,7 +60,9 @@ def compare(scene: Scene, folder: Path) -> None:
         errors = [
             *response_errors(read_response(inputs[0]), log_exposure),
             *radiance_errors(read_rgb(inputs[1]), read_rgb(folder / "set/front.exr") / middle),
-            *lens_errors(CameraModel.read(inputs[2]), CameraModel.read(truth / "view.cameramodel")),
+            *lens_errors(
+                CameraModel.read(inputs[2]), CameraModel.read(truth / "view.cameramodel")
+            ),
             *align_errors(
                 read_json(inputs[3]),
                 CameraModel.read(truth / "front.cameramodel"),
@@ -97,9 +99,7 @@ def response_errors(found: Response, log_exposure: NDArray[np.float64]) -> list[
     return [Error("response", "curve, RMS of ln exposure, codes 10-245", 100 * rms, "%", 3.0)]
 
 
-def radiance_errors(
-    merged: NDArray[np.float32], radiance: NDArray[np.float32]
-) -> list[Error]:
+def radiance_errors(merged: NDArray[np.float32], radiance: NDArray[np.float32]) -> list[Error]:
     """Relative error of the merged fisheye frame, pixel by pixel, inside the lens circle."""
     seen = radiance.min(axis=2) > 0
     error = merged[seen] / radiance[seen] - 1
@@ -150,15 +150,17 @@ def align_errors(align: dict[str, object], true: CameraModel, depth: float) -> l
     ]
 
 
-def irradiance_errors(
-    found: NDArray[np.float32], true: NDArray[np.float32]
-) -> list[Error]:
+def irradiance_errors(found: NDArray[np.float32], true: NDArray[np.float32]) -> list[Error]:
     """Relative error of the irradiance on surfaces facing the six axes, all channels."""
     difference = irradiance(found) / irradiance(true) - 1
     return [
         Error("environment", "irradiance up", 100 * abs(float(difference[2].mean())), "%", 1.5),
         Error(
-            "environment", "irradiance, worst of 6 normals", 100 * float(abs(difference).max()), "%", 3.0
+            "environment",
+            "irradiance, worst of 6 normals",
+            100 * float(abs(difference).max()),
+            "%",
+            3.0,
         ),
     ]
 
@@ -183,7 +185,11 @@ def composite_errors(
     return [
         Error("composite", "changed pixels, median", 100 * float(np.median(error)), "%", 3.0),
         Error(
-            "composite", "changed pixels, 90 % of them", 100 * float(np.quantile(error, 0.9)), "%", 15.0
+            "composite",
+            "changed pixels, 90 % of them",
+            100 * float(np.quantile(error, 0.9)),
+            "%",
+            15.0,
         ),
     ]
 
