@@ -181,7 +181,7 @@ def test_any_json_in_any_place_gives_a_take_or_one_clear_error(
 
 
 def test_deep_nesting_is_no_crash():
-    with pytest.raises(UserError, match="not valid JSON|unknown field"):
+    with pytest.raises(UserError, match=r"not valid JSON|unknown field"):
         parse_take(b'{"x":' + b"[" * 100_000)
 
 
