@@ -213,9 +213,7 @@ class _Run:
         self.references.append(Reference(sample(pixels), row.time))
         self.confirmed = self.confirmed or settle.verdict == "settled"
         ratio = "" if settle.ratio is None else f", brightness {settle.ratio:.3f} of expected"
-        self.say(
-            f"{_text(time)}: {settle.verdict} after {settle.frames_waited} frames{ratio}"
-        )
+        self.say(f"{_text(time)}: {settle.verdict} after {settle.frames_waited} frames{ratio}")
         return row
 
     def resume(self, kept: list[TakeFrame]) -> list[TakeFrame]:
@@ -326,7 +324,7 @@ def _primer(order: list[float], camera: ShutterCamera) -> float:
 def _mean(frames: list[Frame]) -> NDArray[np.uint8]:
     if len(frames) == 1:
         return frames[0].pixels
-    total = sum(frame.pixels.astype(np.uint32) for frame in frames)
+    total = np.sum([frame.pixels for frame in frames], axis=0, dtype=np.uint32)
     return ((total + len(frames) // 2) // len(frames)).astype(np.uint8)
 
 

@@ -183,7 +183,11 @@ class Watch:
         self._first = frame.monotonic if self._first is None else self._first
         if self._reference is None:
             self._reference = self._choose()
-        now = compare(samples, self.time, self._reference, self.curve) if self._reference else None
+        now = (
+            compare(samples, self.time, self._reference, self.curve)
+            if self._reference
+            else None
+        )
         if now is None or math.isnan(now.measured):
             outcome = self._skip(frame)
         else:
@@ -213,9 +217,7 @@ class Watch:
 
     def _choose(self) -> Reference | None:
         """The reference with most samples that are usable at both times."""
-        counts = [
-            compare(r.samples, self.time, r, self.curve).count for r in self.references
-        ]
+        counts = [compare(r.samples, self.time, r, self.curve).count for r in self.references]
         best = max(counts, default=0)
         return self.references[counts.index(best)] if best >= ENOUGH else None
 

@@ -31,7 +31,8 @@ class SocketSource:
         except OSError as error:
             self._socket.close()
             raise DeviceError(
-                f"no video here ({error.strerror or error}); is the emulator running?", file=path
+                f"no video here ({error.strerror or error}); is the emulator running?",
+                file=path,
             ) from error
 
     def grab(self) -> Frame:
@@ -91,7 +92,7 @@ class CaptureSource:
         import cv2
 
         read, bgr = self._capture.read()
-        if not read or bgr is None:
+        if not read:
             what = "delivers no picture; check the cable" if self._live else "the video ended"
             raise DeviceError(what, file=self._path)
         wall, monotonic = time.time(), time.monotonic()

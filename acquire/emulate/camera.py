@@ -122,7 +122,9 @@ class VideoCamera:
             self._old_frames -= 1
             if not self._old_frames:
                 old = self._shown.even
-                fields = (old, self._target) if self._rng.random() < 0.5 else (self._target, old)
+                fields = (
+                    (old, self._target) if self._rng.random() < 0.5 else (self._target, old)
+                )
                 self._shown, self._pixels = Truth(*fields), None
                 self._mixed = True
                 self._exposing = self._frames(self._target)

@@ -50,7 +50,9 @@ class VideoServer:
         except OSError as error:
             self._listener.close()
             self._selector.close()
-            why = "this path is too long for a socket" if "long" in str(error) else error.strerror
+            why = (
+                "this path is too long for a socket" if "long" in str(error) else error.strerror
+            )
             raise UserError(f"no video socket here: {why}", file=self._path) from error
         self._listener.listen()
         self._listener.setblocking(False)

@@ -212,10 +212,8 @@ class ViscaPort:
                 self._reply(bytes([0x90, 0x50, 0, 0, position >> 4, position & 0x0F]))
             case b"\x01\x04\x39" if len(payload) == 4 and payload[3] in set(AutoExposure):
                 self._set(lambda: self.camera.set_mode(AutoExposure(payload[3])), done)
-            case b"\x01\x04\x4a" if self._shutter(payload) is not None:
-                position = self._shutter(payload)
-                assert position is not None
-                self._set(lambda: self.camera.set_shutter(position), done)
+            case b"\x01\x04\x4a" if (place := self._shutter(payload)) is not None:
+                self._set(lambda: self.camera.set_shutter(place), done)
             case _:
                 self._reply(bytes([0x90, 0x60, SYNTAX]))
 

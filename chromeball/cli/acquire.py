@@ -49,7 +49,7 @@ def bracket(
 
     """
     from chromeball.acquire.bracket import capture_bracket
-    from chromeball.acquire.devices import open_camera, open_video
+    from chromeball.acquire.connect import open_camera, open_video
     from chromeball.acquire.settle import read_curve
 
     seconds = _times(times)
