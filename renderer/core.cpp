@@ -1,0 +1,94 @@
+// The Python face of the C++ core: arrays in, arrays out, the GIL released.
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/array.h>
+#include <nanobind/stl/optional.h>
+
+#include "path.h"
+
+namespace nb = nanobind;
+using namespace chromeball;
+
+namespace {
+
+using In3f = nb::ndarray<const float, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
+using In3u = nb::ndarray<const uint32_t, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
+using In1f = nb::ndarray<const float, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
+using In1b = nb::ndarray<const uint8_t, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
+using Picture = nb::ndarray<const float, nb::shape<-1, -1, 3>, nb::c_contig, nb::device::cpu>;
+using Out = nb::ndarray<nb::numpy, float, nb::ndim<3>>;
+
+template <typename Array>
+auto view(const Array& a) {
+  return std::span(a.data(), a.size());
+}
+
+// A float32 picture that Python will own.
+struct NewPicture {
+  size_t height, width, channels;
+  float* data;
+  NewPicture(size_t h, size_t w, size_t c)
+      : height(h), width(w), channels(c), data(new float[h * w * c]()) {}
+  Out release() {
+    nb::capsule owner(data, [](void* p) noexcept { delete[] static_cast<float*>(p); });
+    return Out(data, {height, width, channels}, owner);
+  }
+};
+
+// The faces with their materials; indices are checked by the Python side.
+struct MeshArrays {
+  In3f vertices;
+  std::optional<In3f> normals;
+  In3u faces;
+  In3f albedo, emission;
+  In1b kind;
+  In1f ior;
+
+  Mesh mesh() const {
+    return {view(vertices), normals ? view(*normals) : std::span<const float>(), view(faces),
+            view(albedo), view(emission), view(kind), view(ior)};
+  }
+};
+
+}  // namespace
+
+NB_MODULE(core, m) {
+  nb::class_<MeshArrays>(m, "Mesh")
+      .def("__init__",
+           [](MeshArrays* self, In3f vertices, std::optional<In3f> normals, In3u faces,
+              In3f albedo, In3f emission, In1b kind, In1f ior) {
+             const size_t f = faces.shape(0);
+             if (albedo.shape(0) != f || emission.shape(0) != f || kind.shape(0) != f ||
+                 ior.shape(0) != f || (normals && normals->shape(0) != vertices.shape(0))) {
+               throw nb::value_error("arrays of one mesh differ in length");
+             }
+             for (const uint32_t i : view(faces)) {
+               if (i >= vertices.shape(0)) throw nb::value_error("face index out of range");
+             }
+             new (self) MeshArrays{vertices, normals, faces, albedo, emission, kind, ior};
+           },
+           nb::arg("vertices"), nb::arg("normals").none(), nb::arg("faces"), nb::arg("albedo"),
+           nb::arg("emission"), nb::arg("kind"), nb::arg("ior"));
+
+  m.def(
+      "path_trace",
+      [](const MeshArrays& arrays, Picture corners, std::array<float, 3> origin, int spp,
+         uint64_t seed, int bounces, std::optional<Picture> environment) {
+        const PixelRays rays{corners.data(), int(corners.shape(0)) - 1,
+                             int(corners.shape(1)) - 1};
+        NewPicture out(rays.height, rays.width, 3);
+        {
+          nb::gil_scoped_release release;
+          std::optional<Environment> light;
+          if (environment) {
+            light.emplace(environment->data(), int(environment->shape(0)),
+                          int(environment->shape(1)));
+          }
+          path_trace(arrays.mesh(), rays, Vec3(origin.data()), spp, seed, bounces,
+                     light ? &*light : nullptr, out.data);
+        }
+        return out.release();
+      },
+      nb::arg("mesh"), nb::arg("corners"), nb::arg("origin"), nb::arg("spp"), nb::arg("seed"),
+      nb::arg("bounces"), nb::arg("environment").none());
+}

@@ -1,0 +1,84 @@
+// What shines: a discrete distribution by inverse CDF, and the lat-long environment map.
+#pragma once
+
+#include <cstddef>
+#include <span>
+#include <vector>
+
+#include "vec.h"
+
+namespace chromeball {
+
+// Picks i with probability weight[i] / sum. Inverting the CDF keeps the stratification of the
+// samples over the order of the entries; a guide table makes it O(1) (Chen and Asau 1974).
+class Distribution {
+ public:
+  explicit Distribution(std::span<const float> weight) : cdf_(weight.size() + 1) {
+    for (size_t i = 0; i < weight.size(); ++i) cdf_[i + 1] = cdf_[i] + weight[i];
+    sum_ = cdf_.back();
+    if (!(sum_ > 0)) return;
+    for (double& c : cdf_) c /= sum_;
+    guide_.resize(weight.size() + 1);
+    size_t i = 0;
+    for (size_t g = 0; g < guide_.size(); ++g) {
+      const double u = double(g) / double(weight.size());
+      while (i + 1 < weight.size() && cdf_[i + 1] <= u) ++i;
+      guide_[g] = uint32_t(i);
+    }
+  }
+
+  double sum() const { return sum_; }
+  bool empty() const { return !(sum_ > 0); }
+
+  struct Pick {
+    uint32_t index;
+    float rest;  // what is left of the random number, uniform in 0..1
+  };
+  Pick sample(uint32_t bits) const {
+    const double u = (bits + 0.5) * 0x1p-32;
+    uint32_t i = guide_[size_t(u * double(guide_.size() - 1))];
+    while (cdf_[i + 1] <= u) ++i;
+    return {i, float((u - cdf_[i]) / (cdf_[i + 1] - cdf_[i]))};
+  }
+
+ private:
+  std::vector<double> cdf_;
+  std::vector<uint32_t> guide_;
+  double sum_ = 0;
+};
+
+// A lat-long radiance map with OpenEXR's axes: centre +Z, image right -X, up +Y.
+class Environment {
+ public:
+  // (h, w, 3) floats, row 0 is the zenith.
+  Environment(const float* rgb, int h, int w);
+
+  int height() const { return h_; }
+  int width() const { return w_; }
+  const Distribution& distribution() const { return distribution_; }
+  bool dark() const { return distribution_.empty(); }
+
+  Vec3 radiance(Vec3 d) const;  // bilinear; d of unit length
+  Vec3 texel(uint32_t t) const { return Vec3(&rgb_[3 * size_t(t)]); }
+  float density(Vec3 d) const { return density_[texel_of(d)]; }  // 1/sr
+  float texel_density(uint32_t t) const { return density_[t]; }
+  float texel_solid_angle(uint32_t t) const { return solid_angle_[t / w_]; }
+  Vec3 texel_direction(uint32_t t, float u, float v) const;  // u, v in 0..1 inside the texel
+  uint32_t texel_of(Vec3 d) const;
+
+  struct Sample {
+    Vec3 direction;
+    float density;  // 1/sr
+    uint32_t texel;
+  };
+  Sample sample(uint32_t bits, float v) const;
+
+ private:
+  int h_, w_;
+  std::vector<float> rgb_;
+  std::vector<float> density_, solid_angle_;
+  std::vector<uint32_t> order_;  // texels along a Hilbert curve: near in order, near in space
+  Distribution distribution_;
+};
+
+}  // namespace chromeball

@@ -1,0 +1,113 @@
+"""Objects of the scene file as triangles: primitives and mesh files."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chromeball.renderer.mesh import Kind, Mesh
+from chromeball.renderer.primitives import PRIMITIVES, Triangles
+from chromeball.scene.errors import UserError
+from chromeball.scene.manifest import Object, Scene
+from chromeball.scene.pose import Pose
+
+
+def object_meshes(scene: Scene, folder: str | os.PathLike[str] = ".") -> list[Mesh]:
+    """The triangles of all objects of the scene, in its order; see :func:`object_mesh`."""
+    meshes: list[Mesh] = []
+    for entry in scene.object:
+        try:
+            meshes.append(object_mesh(entry, folder))
+        except UserError as error:
+            where = "" if error.file is None else f"{error.file}: "
+            raise UserError(f"[[object]] {entry.name!r}: {where}{error.what}") from error
+    return meshes
+
+
+def object_mesh(entry: Object, folder: str | os.PathLike[str] = ".") -> Mesh:
+    """The object's triangles in the world; mesh files are relative to `folder`.
+
+    Raises
+    ------
+    UserError
+        When the mesh is neither a primitive nor a readable file, or is broken.
+
+    """
+    if entry.mesh in PRIMITIVES:
+        vertices, faces, normals = PRIMITIVES[entry.mesh]()
+    else:
+        vertices, faces, normals = read_mesh(Path(folder) / entry.mesh)
+    material = entry.material
+    mesh = Mesh.of(
+        vertices,
+        faces,
+        material.color,
+        kind=Kind[material.kind.upper()],
+        ior=material.ior,
+        normals=normals,
+    )
+    return mesh.placed(_pose(entry), entry.scale)
+
+
+def read_mesh(path: str | os.PathLike[str]) -> Triangles:
+    """Vertices, faces and no normals of a mesh file, whatever format MeshLab reads.
+
+    Faces without area are dropped.
+
+    Raises
+    ------
+    UserError
+        When there is no such file, no faces, or vertices are NaN or out of range.
+
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise UserError(
+            f"no such mesh; write a file or one of {', '.join(PRIMITIVES)}", file=path
+        )
+    import pymeshlab
+
+    library: Any = pymeshlab  # its classes come at run time
+
+    meshes = library.MeshSet()
+    try:
+        meshes.load_new_mesh(os.fspath(path), load_in_a_single_layer=True)
+        mesh = meshes.current_mesh()
+        vertices = np.asarray(mesh.vertex_matrix(), np.float32)
+        faces: NDArray[np.int64] = np.asarray(mesh.face_matrix()).astype(np.int64)
+    except library.PyMeshLabException as error:
+        raise UserError(f"not a readable mesh: {error}", file=path) from error
+    if len(faces) == 0:
+        raise UserError("the mesh has no faces", file=path)
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise UserError(
+            f"a face names a vertex that is not among the {len(vertices)}", file=path
+        )
+    bad = ~np.isfinite(vertices).all(axis=1)
+    if bad.any():
+        raise UserError(
+            f"{int(bad.sum())} vertices are NaN or infinite, the first is {int(bad.argmax())}",
+            file=path,
+        )
+    keep = face_areas(vertices, faces) > 0
+    if not keep.any():
+        raise UserError("no face of the mesh has an area", file=path)
+    return vertices, faces[keep].astype(np.uint32), None
+
+
+def face_areas(vertices: NDArray[np.float32], faces: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Area of each triangle, (F,)."""
+    a, b, c = (vertices[faces[:, i]].astype(float) for i in range(3))
+    return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+
+
+def _pose(entry: Object) -> Pose:
+    """Turned about x, then y, then z, then moved."""
+    pose = Pose.identity()
+    for axis, degrees in zip(np.eye(3), entry.rotation, strict=True):
+        pose = Pose.from_rotation_vector(axis * np.radians(degrees), np.zeros(3)) @ pose
+    return Pose(pose.rotation, np.array(entry.position, float))
