@@ -27,12 +27,13 @@ from chromeball.examples.atrium.cameras import (
     probe_camera,
     view_camera,
 )
-from chromeball.examples.atrium.room import CARPET, Geometry, quads, room, triangles
-from chromeball.renderer.path import path_trace
-from chromeball.renderer.scene import object_mesh
+from chromeball.examples.atrium.room import CARPET, quads, room
+from chromeball.renderer.mesh import Mesh
+from chromeball.renderer.path import corner_rays, path_trace
+from chromeball.renderer.scene import object_meshes
 from chromeball.scene.camera import WORLD_FROM_LATLONG, CameraModel
 from chromeball.scene.image import Exposure, write_exr, write_picture
-from chromeball.scene.manifest import Scene, parse_time, read_scene
+from chromeball.scene.manifest import parse_time, read_scene
 from chromeball.scene.pose import Pose
 from chromeball.scene.record import write_json
 
@@ -42,34 +43,20 @@ BOUNCES = 8
 
 
 def radiance(
-    geometry: Geometry, camera: CameraModel, samples: int, bounces: int = BOUNCES
+    mesh: Mesh, camera: CameraModel, samples: int, bounces: int = BOUNCES
 ) -> NDArray[np.float32]:
     """Full light transport to every pixel of `camera`, (H, W, 3)."""
     return path_trace(
-        geometry.vertices,
-        geometry.faces,
-        albedo=geometry.albedo,
-        emission=geometry.emission,
-        camera=camera,
+        mesh,
+        corner_rays(camera),
+        camera.world_from_camera.translation,
         spp=samples,
         seed=7,
-        bounces=bounces,
+        max_bounces=bounces,
     )
 
 
-def objects(scene: Scene, folder: Path) -> Geometry:
-    """The scene's objects as real ones. The set knows diffuse surfaces alone."""
-    parts: list[Geometry] = []
-    for entry in scene.object:
-        mesh = object_mesh(entry, folder)
-        parts.append(triangles(mesh.vertices, mesh.faces, entry.material.color))
-    total = parts[0]
-    for part in parts[1:]:
-        total = total + part
-    return total
-
-
-def board(target: Charuco, pose: Pose) -> Geometry:
+def board(target: Charuco, pose: Pose) -> Mesh:
     """The calibration board as quadrilaterals, one a run of equal cells, with a white rim.
 
     `pose` is world_from_board, metres, the board's z pointing away from its viewer.
@@ -137,12 +124,12 @@ def photograph(folder: Path, samples: int, probe_size: int) -> None:
     target = parse_target(scene.calibrate.target if scene.calibrate else None)
     assert isinstance(target, Charuco)
     for i, pose in enumerate(board_poses(view, BOARD_VIEWS)):
-        picture = radiance(empty + board(target, pose), view, max(4, samples // 8), 2)
+        picture = radiance(Mesh.join([empty, board(target, pose)]), view, max(4, samples // 8), 2)
         codes = SENSOR.expose(picture, 1 / 25, rng)
         write_picture(folder / f"photographs/board_{i:02d}.png", codes)
     say("photographs/board_*.png")
 
-    full = radiance(empty + objects(scene, folder), view, samples)
+    full = radiance(Mesh.join([empty, *object_meshes(scene, folder)]), view, samples)
     photograph_bracket(full, plate_times, folder / "truth/objects", rng)
     changed = np.abs(full - plate).max(axis=2) > 0.03 * plate.max(axis=2)
     write_picture(folder / "truth/changed.png", 255 * changed.astype(np.uint8))

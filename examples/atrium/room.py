@@ -6,10 +6,10 @@ the axes of a perfect alignment are the axes of the set.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from chromeball.renderer.mesh import Mesh
 
 type RGB = tuple[float, float, float]
 
@@ -31,46 +31,17 @@ WINDOW: RGB = (20.0, 26.0, 34.0)
 BLACK: RGB = (0.0, 0.0, 0.0)
 
 
-@dataclass(frozen=True)
-class Geometry:
-    """Triangles: ``vertices`` (V, 3), ``faces`` (F, 3), ``albedo`` and ``emission`` (F, 3)."""
-
-    vertices: NDArray[np.float32]
-    faces: NDArray[np.uint32]
-    albedo: NDArray[np.float32]
-    emission: NDArray[np.float32]
-
-    def __add__(self, other: Geometry) -> Geometry:
-        """Both together."""
-        return Geometry(
-            np.concatenate([self.vertices, other.vertices]),
-            np.concatenate([self.faces, other.faces + np.uint32(len(self.vertices))]),
-            np.concatenate([self.albedo, other.albedo]),
-            np.concatenate([self.emission, other.emission]),
-        )
-
-
-def quads(corners: ArrayLike, albedo: ArrayLike, emission: ArrayLike = BLACK) -> Geometry:
-    """Quadrilaterals ``(N, 4, 3)``, counter-clockwise seen from their front."""
+def quads(corners: ArrayLike, albedo: ArrayLike, emission: ArrayLike = BLACK) -> Mesh:
+    """Quadrilaterals ``(N, 4, 3)``, counter-clockwise seen from their front, a colour each."""
     points = np.asarray(corners, np.float32).reshape(-1, 4, 3)
     count = len(points)
-    first = 4 * np.arange(count, dtype=np.uint32)[:, None]
-    faces = np.concatenate(
-        [first + np.array([0, 1, 2], np.uint32), first + np.array([0, 2, 3], np.uint32)], axis=1
-    ).reshape(-1, 3)
+    first = 4 * np.arange(count)[:, None]
+    faces = np.concatenate([first + [0, 1, 2], first + [0, 2, 3]], axis=1).reshape(-1, 3)
 
     def per_face(color: ArrayLike) -> NDArray[np.float32]:
-        rows = np.broadcast_to(np.asarray(color, np.float32), (count, 3))
-        return np.repeat(rows, 2, axis=0)
+        return np.repeat(np.broadcast_to(np.asarray(color, np.float32), (count, 3)), 2, axis=0)
 
-    return Geometry(points.reshape(-1, 3), faces, per_face(albedo), per_face(emission))
-
-
-def triangles(vertices: ArrayLike, faces: ArrayLike, albedo: ArrayLike) -> Geometry:
-    """A mesh of one albedo."""
-    f = np.asarray(faces, np.uint32)
-    color = np.broadcast_to(np.asarray(albedo, np.float32), (len(f), 3)).copy()
-    return Geometry(np.asarray(vertices, np.float32), f, color, np.zeros_like(color))
+    return Mesh.of(points.reshape(-1, 3), faces, per_face(albedo), per_face(emission))
 
 
 def rectangle(centre: ArrayLike, u: ArrayLike, v: ArrayLike) -> NDArray[np.float64]:
@@ -90,7 +61,7 @@ def box_footprint(
     return np.stack([c - u - v, c + u - v, c + u + v, c - u + v])
 
 
-def box(footprint: NDArray[np.float64], height: float, albedo: RGB) -> Geometry:
+def box(footprint: NDArray[np.float64], height: float, albedo: RGB) -> Mesh:
     """Four sides and a top over a footprint (4, 2)."""
     low = np.stack([footprint[:, 0], np.zeros(4), footprint[:, 1]], axis=1)
     high = low + [0, height, 0]
@@ -106,7 +77,7 @@ def carpet_corners() -> NDArray[np.float64]:
     return np.array([[-x, 0, z], [x, 0, z], [x, 0, -z], [-x, 0, -z]])
 
 
-def room() -> Geometry:
+def room() -> Mesh:
     """The set without any synthetic object."""
     w, h, d = WIDTH / 2, HEIGHT, DEPTH / 2
     x, y, z = np.eye(3)
@@ -130,7 +101,4 @@ def room() -> Geometry:
     ]
     for middle, half, height, turn, albedo in BOXES:
         parts.append(box(box_footprint(middle, half, turn), height, albedo))
-    total = parts[0]
-    for part in parts[1:]:
-        total = total + part
-    return total
+    return Mesh.join(parts)
