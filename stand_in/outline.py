@@ -67,50 +67,44 @@ def area(ring: NDArray[np.float64]) -> float:
 def triangulate(ring: NDArray[np.float64]) -> NDArray[np.int64]:
     """Triangles (N - 2, 3) of indices of a simple ring with positive area, wound like it.
 
-    Ears are cut off one by one (Meisters 1975), the least sliver first.
+    Ears are cut off one by one, the bluntest first. A cut changes its two neighbours alone:
+    a corner that keeps another from being an ear is reflex, so it is never the one cut
+    (Meisters 1975; Eberly, Triangulation by Ear Clipping).
     """
-    left = list(range(len(ring)))
-    triangles: list[tuple[int, int, int]] = []
+    left = np.arange(len(ring))
+    bluntness = np.array([_bluntness(ring, left, place) for place in range(len(ring))])
+    triangles: list[NDArray[np.int64]] = []
     while len(left) > 3:
-        ears = [
-            (_sharpest(ring[list(ear)]), place, ear)
-            for place in range(len(left))
-            if _is_ear(ring, left, ear := _corner(left, place))
-        ]
-        if not ears:  # two-ears theorem: a simple ring has them
+        place = int(bluntness.argmax())
+        if bluntness[place] <= 0:  # a simple ring has two ears
             raise ValueError("not a simple ring with positive area")
-        _, place, ear = max(ears)
-        triangles.append(ear)
-        del left[place]
-    triangles.append((left[0], left[1], left[2]))
-    return np.array(triangles)
+        triangles.append(left[[place - 1, place, (place + 1) % len(left)]])
+        left, bluntness = np.delete(left, place), np.delete(bluntness, place)
+        for near in (place - 1, place % len(left)):
+            bluntness[near] = _bluntness(ring, left, near)
+    return np.array([*triangles, left])
 
 
-def _corner(left: list[int], place: int) -> tuple[int, int, int]:
-    return left[place - 1], left[place], left[(place + 1) % len(left)]
-
-
-def _is_ear(ring: NDArray[np.float64], left: list[int], ear: tuple[int, int, int]) -> bool:
-    a, b, c = ring[list(ear)]
+def _bluntness(ring: NDArray[np.float64], left: NDArray[np.int64], place: int) -> float:
+    """The sine of the sharpest angle of the ear at `place`, zero when it is none."""
+    ear = left[[place - 1, place, (place + 1) % len(left)]]
+    a, b, c = ring[ear]
     if _turn(a, b, c) <= 0:
-        return False
-    others = ring[[index for index in left if index not in ear]]
+        return 0.0
+    others = ring[left[~np.isin(left, ear)]]
     inside = (
         (_turn(a, b, others) >= 0) & (_turn(b, c, others) >= 0) & (_turn(c, a, others) >= 0)
     )
-    return not inside.any()
-
-
-def _sharpest(triangle: NDArray[np.float64]) -> float:
-    """The sine of the sharpest angle, as twice the area over the two longest sides."""
-    sides = np.sort(np.linalg.norm(triangle - np.roll(triangle, 1, axis=0), axis=1))
-    return float(_turn(*triangle) / (sides[1] * sides[2]))
+    if inside.any():
+        return 0.0
+    sides = np.sort(np.linalg.norm(ring[ear] - ring[np.roll(ear, 1)], axis=1))
+    return float(_turn(a, b, c) / (sides[1] * sides[2]))
 
 
 def _turn(a: ArrayLike, b: ArrayLike, c: ArrayLike) -> NDArray[np.float64]:
     """Twice the signed area of the triangle a b c, positive when its normal is +Y."""
     u, v = np.asarray(b) - np.asarray(a), np.asarray(c) - np.asarray(a)
-    return u[..., 1] * v[..., 0] - u[..., 0] * v[..., 1]
+    return np.asarray(u[..., 1] * v[..., 0] - u[..., 0] * v[..., 1])
 
 
 def _square(p: NDArray[np.float64]) -> NDArray[np.float64]:

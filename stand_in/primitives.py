@@ -155,10 +155,10 @@ def _build(entry: StandIn, camera: CameraModel | None) -> Piece:
 
     miss = None
     if entry.height_point is not None:
-        height, miss = height_above(_needed(camera), given[0], entry.height_point)
+        height, miss = height_above(_needed(camera), given[0], list(entry.height_point))
     else:
         assert entry.height is not None
-        height = entry.height
+        height = float(entry.height)
     count = len(ring)
     top = flat + count
     here = np.arange(count)
