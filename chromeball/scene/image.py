@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Generator, Mapping, Sequence
-from contextlib import contextmanager
+import zlib
+from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -71,25 +72,27 @@ def read_image(path: str | os.PathLike[str]) -> Image:
         raise UserError("no such picture", file=path)
     if path.suffix.lower() in RAW_SUFFIXES:
         return _read_raw(path)
+    if not _png_is_whole(path):  # asked first: libpng complains on stderr by itself
+        raise UserError("truncated or damaged picture: the PNG is not whole", file=path)
     import OpenImageIO as oiio
 
     source = oiio.ImageInput.open(os.fspath(path))
     if source is None:
-        raise UserError(f"not a readable picture: {_last_line(oiio.geterror())}", file=path)
+        raise UserError(f"not a readable picture: {_reason(oiio.geterror)}", file=path)
     try:
         spec = source.spec()
         base = {"uint8": "uint8", "uint16": "uint16"}.get(str(spec.format), "float")
         pixels = source.read_image(0, 0, 0, spec.nchannels, base)
         if pixels is None or source.has_error:
             raise UserError(
-                f"truncated or damaged picture: {_last_line(source.geterror())}", file=path
+                f"truncated or damaged picture: {_reason(source.geterror)}", file=path
             )
     finally:
         source.close()
     if path.suffix.lower() in {".jpg", ".jpeg"} and not _jpeg_is_whole(path):
         raise UserError("truncated picture: the JPEG ends early", file=path)
     pixels = np.ascontiguousarray(pixels).reshape(spec.height, spec.width, spec.nchannels)
-    attributes = {a.name: a.value for a in spec.extra_attribs}
+    attributes = _attributes(spec)
     return Image(
         pixels=pixels,
         linear=path.suffix.lower() in LINEAR_SUFFIXES or base == "float",
@@ -129,11 +132,11 @@ def read_header(path: str | os.PathLike[str]) -> Header:
 
     source = oiio.ImageInput.open(os.fspath(path))
     if source is None:
-        raise UserError(f"not a readable picture: {_last_line(oiio.geterror())}", file=path)
+        raise UserError(f"not a readable picture: {_reason(oiio.geterror)}", file=path)
     try:
         spec = source.spec()
         size, channels = (spec.width, spec.height), tuple(spec.channelnames)
-        attributes = {a.name: a.value for a in spec.extra_attribs}
+        attributes = _attributes(spec)
     finally:
         source.close()
     return Header(size, channels, _exposure(attributes), attributes)
@@ -267,13 +270,11 @@ def _write(
 
     target = oiio.ImageOutput.create(os.fspath(temporary))
     if target is None:
-        raise UserError(
-            f"no picture format for this name: {_last_line(oiio.geterror())}", file=path
-        )
+        raise UserError(f"no picture format for this name: {_reason(oiio.geterror)}", file=path)
     if not (target.open(os.fspath(temporary), spec) and target.write_image(pixels)):
-        raise UserError(f"cannot write: {_last_line(target.geterror())}", file=path)
+        raise UserError(f"cannot write: {_reason(target.geterror)}", file=path)
     if not target.close():
-        raise UserError(f"cannot write: {_last_line(target.geterror())}", file=path)
+        raise UserError(f"cannot write: {_reason(target.geterror)}", file=path)
 
 
 @contextmanager
@@ -284,7 +285,12 @@ def _open_raw(path: Path) -> Generator[Any]:
         with rawpy.imread(os.fspath(path)) as raw:
             yield raw
     except (rawpy.LibRawError, OSError) as error:
-        raise UserError(f"not a readable RAW picture: {error}", file=path) from error
+        reason = error.args[0] if error.args else error
+        if isinstance(reason, bytes):
+            reason = reason.decode(errors="replace")
+        raise UserError(
+            f"unknown, truncated or damaged RAW picture: {reason}", file=path
+        ) from error
 
 
 def _read_raw(path: Path) -> Image:
@@ -319,7 +325,7 @@ def _raw_exposure(raw: Any, path: Path) -> Exposure:
             iso=_positive(raw.other.iso_speed),
         )
     try:
-        return _exposure({a.name: a.value for a in source.spec().extra_attribs})
+        return _exposure(_attributes(source.spec()))
     finally:
         source.close()
 
@@ -361,6 +367,36 @@ def _jpeg_is_whole(path: Path) -> bool:
         return b"\xff\xd9" in file.read()
 
 
-def _last_line(message: str) -> str:
-    lines = message.strip().splitlines()
+def _png_is_whole(path: Path) -> bool:
+    """Whether the chunks of a PNG are sound and lead to its end; True for other files."""
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        if file.read(8) != b"\x89PNG\r\n\x1a\n":
+            return True
+        kind = b""
+        while kind != b"IEND":
+            head = file.read(8)
+            length, kind = int.from_bytes(head[:4]), head[4:]
+            if len(head) < 8 or file.tell() + length + 4 > size:
+                return False
+            if zlib.crc32(kind + file.read(length)) != int.from_bytes(file.read(4)):
+                return False
+    return True
+
+
+def _reason(geterror: Callable[[], str]) -> str:
+    """The last line of what OpenImageIO says, which may quote the file's own broken bytes."""
+    try:
+        lines = geterror().strip().splitlines()
+    except UnicodeDecodeError:
+        return "damaged header"
     return lines[-1] if lines else "unknown format"
+
+
+def _attributes(spec: Any) -> dict[str, Any]:
+    """All metadata but strings in an unknown encoding, such as a Latin-1 copyright line."""
+    attributes: dict[str, Any] = {}
+    for attribute in spec.extra_attribs:
+        with suppress(UnicodeDecodeError):
+            attributes[attribute.name] = attribute.value
+    return attributes

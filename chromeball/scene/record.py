@@ -8,6 +8,8 @@ every output once all of them are whole.
 
 from __future__ import annotations
 
+import fcntl
+import glob
 import hashlib
 import json
 import math
@@ -35,6 +37,9 @@ type Json = bool | int | float | str | list[Json] | dict[str, Json] | None
 def atomic_output(path: str | os.PathLike[str]) -> Generator[Path]:
     """Yield a temporary path with the suffix of `path`; rename it to `path` on success.
 
+    The temporary file is hidden, ``.env.x1y2z3w4.exr``, and locked while its writer lives: what
+    a killed run left behind is removed by the next one that writes the same output.
+
     Raises
     ------
     UserError
@@ -44,14 +49,15 @@ def atomic_output(path: str | os.PathLike[str]) -> Generator[Path]:
     final = Path(path)
     try:
         final.parent.mkdir(parents=True, exist_ok=True)
+        _remove_leftovers(final)
         handle, name = tempfile.mkstemp(
             prefix=f".{final.stem}.", suffix=final.suffix, dir=final.parent
         )
     except OSError as error:
         raise UserError(f"cannot write here: {error.strerror}", file=final) from error
-    os.close(handle)
     temporary = Path(name)
     try:
+        fcntl.flock(handle, fcntl.LOCK_EX)
         yield temporary
         with temporary.open("rb") as file:
             os.fsync(file.fileno())
@@ -61,6 +67,19 @@ def atomic_output(path: str | os.PathLike[str]) -> Generator[Path]:
         temporary.replace(final)
     finally:
         temporary.unlink(missing_ok=True)
+        os.close(handle)
+
+
+def _remove_leftovers(final: Path) -> None:
+    """Remove temporary files of `final` that no living process holds."""
+    pattern = f".{glob.escape(final.stem)}.????????{glob.escape(final.suffix)}"
+    for path in final.parent.glob(pattern):
+        try:
+            with path.open("rb") as file:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                path.unlink()
+        except OSError:  # another run is writing it, or has just renamed it
+            continue
 
 
 def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
@@ -152,6 +171,8 @@ class Stage:
         """As :func:`atomic_output`; the output gets a record when the stage ends well."""
         with atomic_output(path) as temporary:
             yield temporary
+            # A run killed before its record is written must not leave an older run's figures.
+            record_path(path).unlink(missing_ok=True)
         self.outputs.append(Path(path))
 
     def __exit__(
