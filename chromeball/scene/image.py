@@ -6,7 +6,7 @@ import math
 import os
 import zlib
 from collections.abc import Callable, Generator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -92,7 +92,7 @@ def read_image(path: str | os.PathLike[str]) -> Image:
     if path.suffix.lower() in {".jpg", ".jpeg"} and not _jpeg_is_whole(path):
         raise UserError("truncated picture: the JPEG ends early", file=path)
     pixels = np.ascontiguousarray(pixels).reshape(spec.height, spec.width, spec.nchannels)
-    attributes = _attributes(spec)
+    attributes = {a.name: a.value for a in spec.extra_attribs}
     return Image(
         pixels=pixels,
         linear=path.suffix.lower() in LINEAR_SUFFIXES or base == "float",
@@ -136,7 +136,7 @@ def read_header(path: str | os.PathLike[str]) -> Header:
     try:
         spec = source.spec()
         size, channels = (spec.width, spec.height), tuple(spec.channelnames)
-        attributes = _attributes(spec)
+        attributes = {a.name: a.value for a in spec.extra_attribs}
     finally:
         source.close()
     return Header(size, channels, _exposure(attributes), attributes)
@@ -325,7 +325,7 @@ def _raw_exposure(raw: Any, path: Path) -> Exposure:
             iso=_positive(raw.other.iso_speed),
         )
     try:
-        return _exposure(_attributes(source.spec()))
+        return _exposure({a.name: a.value for a in source.spec().extra_attribs})
     finally:
         source.close()
 
@@ -357,7 +357,9 @@ def _positive(value: Any) -> float | None:
 
 
 def _text(value: Any) -> str | None:
-    return value.strip() or None if isinstance(value, str) else None
+    if not isinstance(value, str):
+        return None
+    return value.encode(errors="replace").decode().strip() or None  # bytes of no encoding: ?
 
 
 def _jpeg_is_whole(path: Path) -> bool:
@@ -391,12 +393,3 @@ def _reason(geterror: Callable[[], str]) -> str:
     except UnicodeDecodeError:
         return "damaged header"
     return lines[-1] if lines else "unknown format"
-
-
-def _attributes(spec: Any) -> dict[str, Any]:
-    """All metadata but strings in an unknown encoding, such as a Latin-1 copyright line."""
-    attributes: dict[str, Any] = {}
-    for attribute in spec.extra_attribs:
-        with suppress(UnicodeDecodeError):
-            attributes[attribute.name] = attribute.value
-    return attributes
