@@ -73,7 +73,11 @@ NB_MODULE(core, m) {
   m.def(
       "path_trace",
       [](const MeshArrays& arrays, Picture corners, std::array<float, 3> origin, int spp,
-         uint64_t seed, int bounces, std::optional<Picture> environment) {
+         uint64_t seed, int bounces, std::optional<Picture> environment,
+         std::optional<In3f> irradiance, float gather_from) {
+        if (irradiance && irradiance->shape(0) != arrays.vertices.shape(0)) {
+          throw nb::value_error("irradiance and vertices differ in length");
+        }
         const PixelRays rays{corners.data(), int(corners.shape(0)) - 1,
                              int(corners.shape(1)) - 1};
         NewPicture out(rays.height, rays.width, 3);
@@ -85,10 +89,30 @@ NB_MODULE(core, m) {
                           int(environment->shape(1)));
           }
           path_trace(arrays.mesh(), rays, Vec3(origin.data()), spp, seed, bounces,
-                     light ? &*light : nullptr, out.data);
+                     light ? &*light : nullptr, irradiance ? irradiance->data() : nullptr,
+                     gather_from, out.data);
         }
         return out.release();
       },
       nb::arg("mesh"), nb::arg("corners"), nb::arg("origin"), nb::arg("spp"), nb::arg("seed"),
-      nb::arg("bounces"), nb::arg("environment").none());
+      nb::arg("bounces"), nb::arg("environment").none(), nb::arg("irradiance").none(),
+      nb::arg("gather_from"));
+
+  m.def(
+      "irradiance",
+      [](const MeshArrays& arrays, In3f points, In3f normals, int spp, uint64_t seed,
+         int bounces) {
+        if (points.shape(0) != normals.shape(0)) {
+          throw nb::value_error("points and normals differ in length");
+        }
+        NewPicture out(points.shape(0), 1, 3);
+        {
+          nb::gil_scoped_release release;
+          irradiance(arrays.mesh(), points.data(), normals.data(), points.shape(0), spp, seed,
+                     bounces, nullptr, out.data);
+        }
+        return out.release();
+      },
+      nb::arg("mesh"), nb::arg("points"), nb::arg("normals"), nb::arg("spp"), nb::arg("seed"),
+      nb::arg("bounces"));
 }

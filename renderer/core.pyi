@@ -21,4 +21,14 @@ def path_trace(
     seed: int,
     bounces: int,
     environment: NDArray[float32] | None,
+    irradiance: NDArray[float32] | None,
+    gather_from: float,
+) -> NDArray[float32]: ...
+def irradiance(
+    mesh: Mesh,
+    points: NDArray[float32],
+    normals: NDArray[float32],
+    spp: int,
+    seed: int,
+    bounces: int,
 ) -> NDArray[float32]: ...

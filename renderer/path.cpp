@@ -1,5 +1,6 @@
 #include "path.h"
 
+#include <tbb/blocked_range.h>
 #include <tbb/blocked_range2d.h>
 #include <tbb/parallel_for.h>
 
@@ -8,15 +9,19 @@
 namespace chromeball {
 namespace {
 
+constexpr float kCover = 5e-3f;  // metres
 constexpr int kSureBounces = 5;  // roulette may end a path after these
 
 class PathIntegrator {
  public:
-  PathIntegrator(const Mesh& mesh, const Environment* environment, int bounces)
+  PathIntegrator(const Mesh& mesh, const Environment* environment, int bounces,
+                 const float* irradiance = nullptr, float gather_from = 0)
       : mesh_(mesh),
         environment_(environment && !environment->dark() ? environment : nullptr),
         emitters_(power(mesh)),
-        bounces_(bounces) {
+        bounces_(bounces),
+        irradiance_(irradiance),
+        gather_from_(gather_from) {
     if (mesh.size()) {
       accel_.add(mesh.vertices.data(), mesh.vertices.size() / 3, mesh.faces.data(), mesh.size());
     }
@@ -26,10 +31,10 @@ class PathIntegrator {
     if (!emitters_.empty()) inverse_power_ = float(1.0 / emitters_.sum());
   }
 
-  Vec3 radiance(Vec3 o, Vec3 d, Sampler& sampler) const {
+  // bsdf_density of d; 0: the last bounce was specular, or this is the camera ray.
+  Vec3 radiance(Vec3 o, Vec3 d, Sampler& sampler, float bsdf_density = 0, int depth = 0) const {
     Vec3 sum, beta(1.0f);
-    float bsdf_density = 0;  // 0: the last bounce was specular, or this is the camera ray
-    for (int depth = 0;; ++depth) {
+    for (;; ++depth) {
       const Hit hit = accel_.intersect(o, d);
       if (!hit) {
         if (environment_) {
@@ -59,6 +64,10 @@ class PathIntegrator {
       if (largest(beta) == 0) return sum;
 
       if (kind == Kind::diffuse) {
+        if (irradiance_ && bsdf_density > 0 && s.outside && hit.t > gather_from_) {
+          const Vec3 known = known_irradiance(hit);
+          if (is_finite(known)) return sum + (1 / kPi) * beta * known;
+        }
         const Frame frame(s.ns);
         const Vec3 start = lift(s.p, s.ng);
         sum += beta * direct(start, s, sampler);
@@ -83,7 +92,27 @@ class PathIntegrator {
     }
   }
 
+  // Whether another face lies on this one, as a lamp lies on a ceiling.
+  bool covered(Vec3 p, Vec3 n) const { return accel_.intersect(lift(p, n), n).t < kCover; }
+
+  // One sample of the irradiance at a point with normal n.
+  Vec3 irradiance(Vec3 p, Vec3 n, Sampler& sampler) const {
+    const Surface s{p, n, n, true};
+    const Vec3 start = lift(p, n);
+    Vec3 sum = direct(start, s, sampler);
+    const Pair u = sampler.pair();
+    const Vec3 local = sample_cosine(u.x, u.y);
+    sum += radiance(start, Frame(n).world(local), sampler, std::max(local.z, 1e-6f) / kPi, 1);
+    return kPi * sum;
+  }
+
  private:
+  Vec3 known_irradiance(const Hit& hit) const {
+    const uint32_t* f = &mesh_.faces[3 * hit.face];
+    return (1 - hit.u - hit.v) * Vec3(&irradiance_[3 * f[0]]) +
+           hit.u * Vec3(&irradiance_[3 * f[1]]) + hit.v * Vec3(&irradiance_[3 * f[2]]);
+  }
+
   static std::vector<float> power(const Mesh& mesh) {
     std::vector<float> p(mesh.size());
     for (uint32_t f = 0; f < mesh.size(); ++f) {
@@ -140,14 +169,17 @@ class PathIntegrator {
   Distribution emitters_;
   Accel accel_;
   int bounces_;
+  const float* irradiance_;
+  float gather_from_;
   float pick_environment_ = 0, inverse_power_ = 0;
 };
 
 }  // namespace
 
 void path_trace(const Mesh& mesh, const PixelRays& rays, Vec3 origin, int spp, uint64_t seed,
-                int bounces, const Environment* environment, float* radiance) {
-  const PathIntegrator integrator(mesh, environment, bounces);
+                int bounces, const Environment* environment, const float* irradiance,
+                float gather_from, float* radiance) {
+  const PathIntegrator integrator(mesh, environment, bounces, irradiance, gather_from);
   const SampleTable table(spp, seed);
   const tbb::blocked_range2d<int> tiles(0, rays.height, 16, 0, rays.width, 16);
   tbb::parallel_for(tiles, [&](const auto& tile) {
@@ -167,6 +199,27 @@ void path_trace(const Mesh& mesh, const PixelRays& rays, Vec3 origin, int spp, u
         radiance[3 * pixel] = out.x, radiance[3 * pixel + 1] = out.y;
         radiance[3 * pixel + 2] = out.z;
       }
+    }
+  });
+}
+
+void irradiance(const Mesh& mesh, const float* points, const float* normals, size_t count,
+                int spp, uint64_t seed, int bounces, const Environment* environment,
+                float* irradiance) {
+  const PathIntegrator integrator(mesh, environment, bounces);
+  const SampleTable table(spp, seed);
+  tbb::parallel_for(tbb::blocked_range<size_t>(0, count, 64), [&](const auto& range) {
+    const FlushDenormals flush;
+    for (size_t k = range.begin(); k < range.end(); ++k) {
+      const Vec3 p(&points[3 * k]), n(&normals[3 * k]);
+      Vec3 sum;
+      for (int i = 0; i < spp; ++i) {
+        Sampler sampler(table, mix64(seed) + k, i);
+        sum += integrator.irradiance(p, n, sampler);
+      }
+      if (integrator.covered(p, n)) sum = Vec3(std::numeric_limits<float>::quiet_NaN());
+      const Vec3 out = sum * (1.0f / float(spp));
+      irradiance[3 * k] = out.x, irradiance[3 * k + 1] = out.y, irradiance[3 * k + 2] = out.z;
     }
   });
 }

@@ -34,6 +34,8 @@ def path_trace(
     seed: int = 0,
     max_bounces: int = 8,
     environment: NDArray[np.float32] | None = None,
+    irradiance: NDArray[np.float32] | None = None,
+    gather_from: float = 0.0,
 ) -> NDArray[np.float32]:
     """Radiance (H, W, 3) float32 that a camera sees, the mean of `spp` paths a pixel.
 
@@ -54,6 +56,9 @@ def path_trace(
         Most scatterings on a path: 0 shows the lamps alone, 1 is direct light.
     environment
         (h, w, 3) lat-long radiance around the set, OpenEXR's axes; none: black.
+    irradiance, gather_from
+        (V, 3) known at the vertices: a path ends where it meets a second diffuse surface more
+        than `gather_from` metres away; NaN where unknown (:mod:`chromeball.renderer.gather`).
 
     """
     if spp < 1 or max_bounces < 0:
@@ -67,4 +72,6 @@ def path_trace(
         seed,
         max_bounces,
         None if environment is None else np.ascontiguousarray(environment, np.float32),
+        None if irradiance is None else np.ascontiguousarray(irradiance, np.float32),
+        gather_from,
     )

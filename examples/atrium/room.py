@@ -7,9 +7,9 @@ the axes of a perfect alignment are the axes of the set.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from chromeball.renderer.mesh import Mesh
+from chromeball.renderer.mesh import Mesh, Values
 
 type RGB = tuple[float, float, float]
 
@@ -31,20 +31,20 @@ WINDOW: RGB = (20.0, 26.0, 34.0)
 BLACK: RGB = (0.0, 0.0, 0.0)
 
 
-def quads(corners: ArrayLike, albedo: ArrayLike, emission: ArrayLike = BLACK) -> Mesh:
+def quads(corners: Values, albedo: Values, emission: Values = BLACK) -> Mesh:
     """Quadrilaterals ``(N, 4, 3)``, counter-clockwise seen from their front, a colour each."""
     points = np.asarray(corners, np.float32).reshape(-1, 4, 3)
     count = len(points)
     first = 4 * np.arange(count)[:, None]
     faces = np.concatenate([first + [0, 1, 2], first + [0, 2, 3]], axis=1).reshape(-1, 3)
 
-    def per_face(color: ArrayLike) -> NDArray[np.float32]:
+    def per_face(color: Values) -> NDArray[np.float32]:
         return np.repeat(np.broadcast_to(np.asarray(color, np.float32), (count, 3)), 2, axis=0)
 
     return Mesh.of(points.reshape(-1, 3), faces, per_face(albedo), per_face(emission))
 
 
-def rectangle(centre: ArrayLike, u: ArrayLike, v: ArrayLike) -> NDArray[np.float64]:
+def rectangle(centre: Values, u: Values, v: Values) -> NDArray[np.float64]:
     """Corners (4, 3) of centre +- u +- v; the front is along u x v."""
     c, u, v = (np.asarray(a, float) for a in (centre, u, v))
     return np.stack([c - u - v, c + u - v, c + u + v, c - u + v])
@@ -65,9 +65,7 @@ def box(footprint: NDArray[np.float64], height: float, albedo: RGB) -> Mesh:
     """Four sides and a top over a footprint (4, 2)."""
     low = np.stack([footprint[:, 0], np.zeros(4), footprint[:, 1]], axis=1)
     high = low + [0, height, 0]
-    sides = [
-        np.stack([low[(i + 1) % 4], low[i], high[i], high[(i + 1) % 4]]) for i in range(4)
-    ]
+    sides = [np.stack([low[(i + 1) % 4], low[i], high[i], high[(i + 1) % 4]]) for i in range(4)]
     return quads(np.stack([*sides, high[::-1]]), albedo)
 
 
