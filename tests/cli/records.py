@@ -32,7 +32,7 @@ FIGURES: dict[str, dict[str, Any]] = {
 }
 
 
-def plot(path: Path, width: int = 700, height: int = 400) -> None:
+def plot(path: Path, width: int = 140, height: int = 80) -> None:
     """A picture with something in it."""
     y, x = np.mgrid[0:height, 0:width]
     rgb = np.stack([x % 256, y % 256, (x + y) // 8 % 256], axis=2).astype(np.uint8)
@@ -53,7 +53,7 @@ def record_all(root: Path, leave_out: tuple[str, ...] = ()) -> None:
             for output in stage.outputs:
                 with run.output(root / output) as temporary:
                     if output.endswith(".png"):
-                        plot(temporary, 960, 600)
+                        plot(temporary, 192, 120)
                     else:
                         temporary.write_text(stage.name)
         for name in ("response.png", "residuals.png", "env.png"):

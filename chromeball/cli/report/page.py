@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -121,8 +122,8 @@ def write_report(scene_file: Path, output: Path) -> str:
             verdict=verdict,
             sections=sections,
             bars=_bars(sections),
-            total=sum(s.run.record.seconds for s in sections if s.run),
-            cpu=sum(s.run.record.cpu_seconds for s in sections if s.run),
+            total=math.fsum(s.run.record.seconds for s in sections if s.run),
+            cpu=math.fsum(s.run.record.cpu_seconds for s in sections if s.run),
             heroes=heroes,
             skipped=[stage for stage in planned if not stage.needed],
             errors=errors,
@@ -153,7 +154,12 @@ def render_page(**values: Any) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    functions = {"show": show, "seconds": seconds, "megabytes": megabytes, "bar": bar}
+    functions: dict[str, Any] = {
+        "show": show,
+        "seconds": seconds,
+        "megabytes": megabytes,
+        "bar": bar,
+    }
     return environment.get_template("page.html.j2", globals=functions).render(**values)
 
 
@@ -235,12 +241,12 @@ def _pictures(run: Run | None, figures: Figures, root: Path) -> tuple[Shown, ...
 def _bars(sections: Sequence[Section]) -> list[tuple[Section, float, float]]:
     """Each section with the lengths of its bars, percent: wall time, CPU time."""
     records = [section.run.record if section.run else None for section in sections]
-    longest = max((max(r.seconds, r.cpu_seconds) for r in records if r), default=0) or 1.0
+    longest = max((max(r.seconds, r.cpu_seconds) for r in records if r), default=0.0) or 1.0
     return [
         (
             section,
-            100 * (record.seconds / longest if record else 0),
-            100 * (record.cpu_seconds / longest if record else 0),
+            100 * record.seconds / longest if record else 0.0,
+            100 * record.cpu_seconds / longest if record else 0.0,
         )
         for section, record in zip(sections, records, strict=True)
     ]
