@@ -1,0 +1,57 @@
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+class Projection:
+    @classmethod
+    def latlong(cls, width: int, height: int, /) -> Self: ...
+    @classmethod
+    def cube(cls, width: int, height: int, /) -> Self: ...
+    @classmethod
+    def radial(
+        cls,
+        width: int,
+        height: int,
+        fx: float,
+        fy: float,
+        cx: float,
+        cy: float,
+        max_angle: float,
+        rim: float,
+        radius: NDArray[np.float32],
+        angle: NDArray[np.float32],
+        density: NDArray[np.float32],
+        /,
+    ) -> Self: ...
+    @classmethod
+    def table(
+        cls,
+        width: int,
+        height: int,
+        nodes: int,
+        pixels: NDArray[np.float32],
+        directions: NDArray[np.float32],
+        /,
+    ) -> Self: ...
+    def project(self, directions: NDArray[np.float64], /) -> NDArray[np.float64]: ...
+    def unproject(self, pixels: NDArray[np.float64], /) -> NDArray[np.float64]: ...
+
+def warp(
+    source: NDArray[np.float32],
+    valid: NDArray[np.bool_],
+    source_solid: NDArray[np.float32],
+    target_solid: NDArray[np.float32],
+    from_: Projection,
+    to: Projection,
+    source_from_target: NDArray[np.float64],
+    cap: float,
+    smooth: bool,
+    /,
+) -> tuple[
+    NDArray[np.float32],
+    NDArray[np.float32],
+    int,
+    tuple[float, float, float],
+    tuple[float, float, float],
+]: ...
