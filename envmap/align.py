@@ -81,7 +81,9 @@ def align(
         if value is not None and not 0 < value < math.inf:
             raise UserError(f"the {name} must be positive metres, not {value:g}")
     if width is None and depth is None and camera_height is None:
-        raise UserError("give the rectangle's width or depth, or the camera's height, in metres")
+        raise UserError(
+            "give the rectangle's width or depth, or the camera's height, in metres"
+        )
     size = np.array(camera.size)
     d = camera.unproject(q)
     outside = ~np.isfinite(d).all(axis=1) | ((q < -0.5) | (q > size - 0.5)).any(axis=1)
@@ -257,7 +259,9 @@ def _fit(state: _State, d: Array) -> tuple[_State, Array, Array]:
         off = np.einsum("ijk,ij->ik", tangents, c)
         sine = np.linalg.norm(off, axis=1)
         angle = np.arctan2(sine, np.sum(c * d, axis=1))
-        return (off * np.where(sine > 0, angle / np.where(sine > 0, sine, 1), 1)[:, None]).ravel()
+        return (
+            off * np.where(sine > 0, angle / np.where(sine > 0, sine, 1), 1)[:, None]
+        ).ravel()
 
     def jacobian(s: _State) -> Array:
         # of the unit corner, which is the angle's to first order
@@ -305,7 +309,7 @@ def _click_covariance(camera: CameraModel, q: Array, d: Array) -> Array:
 def _tangents(d: Array) -> Array:
     """Two unit vectors at right angles to d, (3, 2)."""
     side = np.eye(3)[int(np.argmin(np.abs(d)))]
-    a = _unit(np.cross(d, side))
+    a = _unit(np.asarray(np.cross(d, side), float))
     return np.stack([a, np.cross(d, a)], axis=1)
 
 
@@ -357,7 +361,7 @@ def read_alignment(path: str | os.PathLike[str]) -> tuple[Pose, str | None]:
 def overlay(
     display: NDArray[np.uint8], camera: CameraModel, alignment: Alignment, points: ArrayLike
 ) -> NDArray[np.uint8]:
-    """Horizon (yellow), floor grid (grey), axes X Y Z (red, green, blue), clicks (white).
+    """Horizon (yellow), floor grid (grey), axes X Y Z (red, green, blue), clicks (magenta).
 
     `display` (H, W, 3) uint8 is the picture that was clicked in.
     """
@@ -374,8 +378,10 @@ def overlay(
         inside = np.isfinite(q).all(axis=1)
         for a, b, ok in zip(q[:-1], q[1:], inside[:-1] & inside[1:], strict=True):
             if ok and np.abs(a - b).max() < max(width, height) / 8:
-                ends = [(round(float(p[0]) * 16), round(float(p[1]) * 16)) for p in (a, b)]
-                cv2.line(picture, *ends, color, weight, cv2.LINE_AA, 4)
+                start, end = (
+                    (round(float(p[0]) * 16), round(float(p[1]) * 16)) for p in (a, b)
+                )
+                cv2.line(picture, start, end, color, weight, cv2.LINE_AA, 4)
 
     t = np.linspace(0, 1, 200)[:, None]
     half = max(alignment.width, alignment.depth) * 2
@@ -387,7 +393,9 @@ def overlay(
     phi = np.linspace(0, 2 * math.pi, 721)
     ring = np.stack([np.cos(phi), np.zeros_like(phi), np.sin(phi)], axis=1)
     line(origin + 1e6 * ring, (255, 220, 0))
-    for axis, color in zip(np.eye(3), ((255, 60, 60), (60, 220, 60), (80, 120, 255)), strict=True):
+    for axis, color in zip(
+        np.eye(3), ((255, 60, 60), (60, 220, 60), (80, 120, 255)), strict=True
+    ):
         line(t * axis * half / 2, color, 2 * thickness)
     line(
         np.concatenate(
@@ -398,7 +406,7 @@ def overlay(
                 )
             ]
         ),
-        (255, 255, 255),
+        (255, 0, 255),
     )
     for number, p in enumerate(np.asarray(points, float), 1):
         centre = (round(float(p[0])), round(float(p[1])))

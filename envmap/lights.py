@@ -20,9 +20,7 @@ from chromeball.scene.errors import UserError
 type Array = NDArray[np.float64]
 
 #: The six normals for which irradiance is compared: +X -X +Y -Y +Z -Z.
-NORMALS = np.array(
-    [[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], float
-)
+NORMALS = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], float)
 
 
 @dataclass(frozen=True)
@@ -57,8 +55,8 @@ class Lights:
         known = np.isfinite(self.positions).all(axis=1)
         return {
             "lights": [
-                {"direction": d, "radiance": l, "solid_angle": s, "position": p if ok else None}
-                for d, l, s, p, ok in zip(
+                {"direction": d, "radiance": r, "solid_angle": s, "position": p if ok else None}
+                for d, r, s, p, ok in zip(
                     self.directions,
                     self.radiance,
                     self.solid_angles,
@@ -118,7 +116,7 @@ def variance_cut(
     while heap and len(heap) + len(leaves) < count:
         spread, _, region = heapq.heappop(heap)
         # what remains of rounding in a region of one point of light
-        if -spread <= 1e-14 * float(table[-1, -1, 0]):
+        if -spread <= 1e-12 * float(table[-1, -1, 0]):
             leaves.append(region)
             continue
         parts = _cut(table, region)
@@ -151,11 +149,14 @@ def variance_cut(
     total = energy_rgb.sum(axis=(0, 1))
     residual = None
     if ambient:
-        basis = sh_basis(d)
-        map_sh = np.einsum("hwk,hwc->kc", basis, energy_rgb)
+        map_sh = np.zeros((9, 3))
+        for row, here in zip(d, energy_rgb, strict=True):  # a row at a time: memory
+            map_sh += sh_basis(row).T @ here
         lights_sh = sh_basis(directions).T @ (means * solids[:, None])
         residual = map_sh - lights_sh
-    cosines = np.maximum(np.einsum("hwk,nk->hwn", d, NORMALS), 0)
+    irradiance = np.stack(
+        [np.einsum("hw,hwc->c", np.maximum(d @ normal, 0), energy_rgb) for normal in NORMALS]
+    )
     return Lights(
         directions=directions,
         radiance=means,
@@ -163,7 +164,7 @@ def variance_cut(
         positions=positions,
         ambient=residual,
         total=total,
-        irradiance=np.einsum("hwn,hwc->nc", cosines, energy_rgb),
+        irradiance=irradiance,
     )
 
 

@@ -13,7 +13,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Self
+from typing import Self, override
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -82,12 +82,15 @@ class LatLong(Mapping):
     def _camera(self) -> CameraModel:
         return CameraModel.latlong(self.size)
 
+    @override
     def project(self, directions: ArrayLike) -> Array:
         return self._camera.project(directions)
 
+    @override
     def unproject(self, pixels: ArrayLike) -> Array:
         return self._camera.unproject(pixels)
 
+    @override
     def solid_angles(self) -> Array:
         width, height = self.size
         edges = np.linspace(-math.pi / 2, math.pi / 2, height + 1)
@@ -97,6 +100,7 @@ class LatLong(Mapping):
         return np.repeat(row[:, None], width, axis=1)
 
     @cached_property
+    @override
     def kernel(self) -> kernel.Projection:
         return kernel.Projection.latlong(*self.size)
 
@@ -120,6 +124,7 @@ class Cube(Mapping):
         """Pixels a side of a face."""
         return self.size[0] // 4
 
+    @override
     def project(self, directions: ArrayLike) -> Array:
         d = np.asarray(directions, float)
         pixels = np.full((*d.shape[:-1], 2), np.nan)
@@ -134,6 +139,7 @@ class Cube(Mapping):
             pixels[here] = q[here]
         return pixels
 
+    @override
     def unproject(self, pixels: ArrayLike) -> Array:
         q = (np.asarray(pixels, float) + 0.5) / self.face
         d = np.full((*q.shape[:-1], 3), np.nan)
@@ -145,6 +151,7 @@ class Cube(Mapping):
             d[here] = v / np.linalg.norm(v, axis=-1, keepdims=True)
         return d
 
+    @override
     def solid_angles(self) -> Array:
         n = self.face
         edge = np.linspace(-1, 1, n + 1)
@@ -157,6 +164,7 @@ class Cube(Mapping):
         return solid
 
     @cached_property
+    @override
     def kernel(self) -> kernel.Projection:
         return kernel.Projection.cube(*self.size)
 
@@ -179,6 +187,7 @@ class Radial(Mapping):
         """r(max_angle)."""
         return float(self.radius(np.array([self.max_angle]))[0])
 
+    @override
     def project(self, directions: ArrayLike) -> Array:
         d = np.asarray(directions, float)
         rho = np.hypot(d[..., 0], d[..., 1])
@@ -190,6 +199,7 @@ class Radial(Mapping):
         q[~seen] = np.nan
         return q
 
+    @override
     def unproject(self, pixels: ArrayLike) -> Array:
         xy = (np.asarray(pixels, float) - self.centre) / self.focal
         r = np.hypot(xy[..., 0], xy[..., 1])
@@ -200,6 +210,7 @@ class Radial(Mapping):
         d[~seen] = np.nan
         return d
 
+    @override
     def solid_angles(self) -> Array:
         """By Green: Omega = closed integral of (1 - cos theta(min(r, rim))) dphi.
 
@@ -229,7 +240,7 @@ class Radial(Mapping):
         return solid
 
     def _mean_density(self, r: Array) -> Array:
-        """Solid angle of a pixel at radius r, from the cap's 1 - cos theta(r) by differences."""
+        """Solid angle of a pixel at radius r, by differences of 1 - cos theta(r)."""
         fx, fy = np.abs(self.focal)
         h = 1 / math.sqrt(fx * fy)
         r = np.clip(r, 2 * h, self.rim - 2 * h)
@@ -256,6 +267,7 @@ class Radial(Mapping):
         return total
 
     @cached_property
+    @override
     def kernel(self) -> kernel.Projection:
         theta = np.linspace(0, self.max_angle, _TABLE)
         u = np.linspace(0, 1, _TABLE)
@@ -290,6 +302,7 @@ class Lens(Mapping):
 
     camera: CameraModel
 
+    @override
     def project(self, directions: ArrayLike) -> Array:
         q = self.camera.project(directions)
         width, height = self.size
@@ -303,9 +316,11 @@ class Lens(Mapping):
         q[~(seen & (cosine > 1 - 1e-6))] = np.nan
         return q
 
+    @override
     def unproject(self, pixels: ArrayLike) -> Array:
         return self.camera.unproject(pixels)
 
+    @override
     def solid_angles(self) -> Array:
         """Of the spherical quadrilaterals between the rays of the pixel corners."""
         d = self._corners()
@@ -317,6 +332,7 @@ class Lens(Mapping):
         return self.camera.unproject(pixel_grid(self.size, -0.5, more=1))
 
     @cached_property
+    @override
     def kernel(self) -> kernel.Projection:
         edge = np.linspace(-1, 1, _NODES)
         a, b = np.meshgrid(edge, edge)
@@ -461,28 +477,33 @@ def sized(name: str, width: int) -> tuple[int, int]:
 def parse_lens(spec: str, size: tuple[int, int]) -> CameraModel:
     """``equisolid:FOV[:cx,cy,radius]``, degrees and pixels, as a fisheye on `size`.
 
+    An empty centre or radius is the picture's own.
+
     Raises
     ------
     UserError
         When it cannot be read.
 
     """
-    parts: list[Any] = spec.split(":")
+    model, _, rest = spec.partition(":")
+    fov_text, _, circle_text = rest.partition(":")
     try:
-        fov = float(parts[1])
-        circle = [float(v) for v in parts[2].split(",")] if len(parts) > 2 else []
-        if len(parts) > 3 or len(circle) not in (0, 3) or not 0 < fov <= 360:
+        fov = float(fov_text)
+        cx, cy, radius = (
+            float(v) if v.strip() else None for v in (circle_text or ",,").split(",")
+        )
+        if not 0 < fov <= 360 or (radius is not None and not 0 < radius < math.inf):
             raise ValueError
-        if circle and not circle[2] > 0:
+        if (cx is None) != (cy is None):
             raise ValueError
-    except (ValueError, IndexError) as error:
+    except ValueError as error:
         raise UserError(
             f"--lens {spec!r}: write MODEL:FOV or MODEL:FOV:cx,cy,radius, e.g. equisolid:186"
         ) from error
     return CameraModel.fisheye(
-        parts[0],
+        model,
         size,
         math.radians(fov),
-        centre=(circle[0], circle[1]) if circle else None,
-        radius=circle[2] if circle else None,
+        centre=None if cx is None or cy is None else (cx, cy),
+        radius=radius,
     )

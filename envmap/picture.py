@@ -1,0 +1,100 @@
+"""Maps in and out: lat-long EXRs with their attributes, and pictures of them to look at."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chromeball.scene.color import luminance
+from chromeball.scene.errors import UserError
+from chromeball.scene.image import read_image, to_display, write_picture
+
+
+def read_radiance(
+    path: str | os.PathLike[str],
+) -> tuple[NDArray[np.float32], NDArray[np.bool_] | None, dict[str, Any]]:
+    """Read (H, W, 3) radiance, where it is valid, and the attributes worth keeping.
+
+    Pixels whose alpha is 0, NaN or infinite pixels under alpha 0 included, are not valid;
+    without an alpha channel all are (None).
+
+    Raises
+    ------
+    UserError
+        When the file is no linear picture, or a valid pixel is NaN, infinite or negative.
+
+    """
+    image = read_image(path)
+    if not image.linear:
+        raise UserError(
+            "not a scene-linear picture; merge it with `hdr merge` first", file=path
+        )
+    names = list(image.channels)
+    pixels = image.pixels.astype(np.float32, copy=False)
+    if all(name in names for name in "RGB"):
+        rgb = pixels[..., [names.index(name) for name in "RGB"]]
+    elif len(names) in (1, 2):
+        rgb = np.repeat(pixels[..., :1], 3, axis=2)
+    else:
+        raise UserError(f"no channels R, G, B: it holds {', '.join(names)}", file=path)
+    valid = pixels[..., names.index("A")] > 0 if "A" in names else None
+    bad = ~(np.isfinite(rgb) & (rgb >= 0)).all(axis=2)
+    if valid is not None:
+        rgb = np.where((bad & ~valid)[..., None], np.float32(0), rgb)
+        bad &= valid
+    if bad.any():
+        y, x = np.argwhere(bad)[0]
+        raise UserError(
+            f"{int(bad.sum())} pixels are NaN, infinite or negative, the first at x {x}, y {y}",
+            file=path,
+        )
+    kept = {
+        name: image.attributes[name]
+        for name in ("chromaticities", "whiteLuminance", "origin")
+        if name in image.attributes
+    }
+    return np.ascontiguousarray(rgb), valid, kept
+
+
+def latlong_attributes(kept: Mapping[str, Any], origin: Any = None) -> dict[str, Any]:
+    """Attributes of a lat-long EXR; OpenImageIO writes `textureformat` as OpenEXR's envmap."""
+    attributes: dict[str, Any] = {**kept, "textureformat": "LatLong Environment"}
+    if origin is not None:
+        attributes["origin"] = np.asarray(origin, float)
+    return attributes
+
+
+def tone_mapped(
+    rgb: NDArray[np.float32], alpha: NDArray[np.float32] | None = None, width: int = 1024
+) -> NDArray[np.uint8]:
+    """For looking at: the median at a quarter grey, highlights rolled off; no measurement.
+
+    Pixels of alpha 0 are darkened. At most `width` pixels across.
+    """
+    import cv2
+
+    step = max(1.0, rgb.shape[1] / width)
+    size = (round(rgb.shape[1] / step), max(1, round(rgb.shape[0] / step)))
+    small = np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.float32)
+    y = luminance(small)
+    lit = y[y > 0]
+    scale = 0.25 / float(np.median(lit)) if lit.size else 1.0
+    y = y * scale
+    # Reinhard et al. 2002, eq. 4, white at 16 times the middle
+    small = small * (scale * (1 + y / 16) / (1 + y))[..., None]
+    if alpha is not None:
+        seen = np.asarray(cv2.resize(alpha, size, interpolation=cv2.INTER_AREA))
+        small = small * (0.35 + 0.65 * np.clip(seen, 0, 1))[..., None]
+    return to_display(small)
+
+
+def write_preview(output: Path, kind: str, display: NDArray[np.uint8]) -> str:
+    """Write ``env.KIND.png`` beside ``env.exr``; its name, for the record's figures."""
+    path = output.with_name(f"{output.stem}.{kind}.png")
+    write_picture(path, display)
+    return path.name
