@@ -169,7 +169,7 @@ class _Planner:
         users = ["the light probe" for shot in self.shots if shot.bracket == bracket.name]
         users += [f"view {view.name}" for view in self.rendered if view.bracket == bracket.name]
         if not self.scene.probe and not self.scene.view:
-            users.append("radiance is all this scene asks for")
+            users.append("its own sake")
         return list(dict.fromkeys(users))
 
     def _expanded(self, bracket: Bracket) -> list[str]:
