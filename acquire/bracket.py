@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from chromeball.acquire.devices import Frame, FrameSource, ShutterCamera
 from chromeball.acquire.journal import Bracket, Journal
 from chromeball.acquire.settle import (
+    DRIFT,
     RATIO,
     SKIP,
     Curve,
@@ -104,7 +105,7 @@ def capture_bracket(
     if average < 1:
         raise UserError(f"cannot average {average} frames; 1 or more")
     matched = match_times(times, camera.speeds)
-    requested = dict(zip(matched, times, strict=True))
+    requested = {m: float(t) for m, t in zip(matched, times, strict=True)}
     file = take_path(output)
     curve = curve or generic_curve()
     bracket = Bracket(
@@ -244,14 +245,22 @@ class _Run:
         """The first reference: set and left alone for longer than any change may take."""
         before = self.camera.shutter()
         self.camera.set_shutter(time)
-        first = frame = self._grab()
-        count = 1
-        while count < factor * SKIP or (
-            frame.monotonic - first.monotonic < factor * (before + 2 * time)
-        ):
+        frame = self._grab()
+        begin, count, steady = frame.monotonic, 1, 0
+        last = Reference(sample(frame.pixels), time)
+        while True:
+            passed = frame.monotonic - begin
+            waited = count >= factor * SKIP and passed >= factor * (before + 2 * time)
+            if waited and (steady >= 2 or passed > self.patience + 6 * max(before, time)):
+                break
             frame = self._grab()
+            samples = sample(frame.pixels)
+            # Comparing with nothing usable gives NaN, which counts as steady: no news.
+            moved = abs(compare(samples, time, last, self.curve).measured) > DRIFT / 2
+            steady = 0 if moved else steady + 1
+            last = Reference(samples, time)
             count += 1
-        self.references = [Reference(sample(frame.pixels), time)]
+        self.references = [last]
         self.before = time
 
     def _settle(self, time: float) -> tuple[Watch | None, list[Frame]]:
@@ -259,13 +268,14 @@ class _Run:
         self.camera.set_shutter(time)
         watch = Watch(self.curve, self.references, time, self.before)
         self.before = time
-        begin, frames, seen = clock.monotonic(), list[Frame](), 0
+        begin, frames, seen = None, list[Frame](), 0
         patience = self.patience + 6 * max(time, watch.before)
         while True:
             frame = self._grab()
             seen += 1
+            begin = frame.monotonic if begin is None else begin
             outcome = watch.feed(frame, sample(frame.pixels))
-            spent = seen > 2 * SKIP and clock.monotonic() - begin > patience
+            spent = seen > 2 * SKIP and frame.monotonic - begin > patience
             if outcome != "waiting" or (spent and self._is_plateau(watch)):
                 # A slow shutter repeats its picture: averaged frames are an exposure apart.
                 if not frames or frame.monotonic - frames[-1].monotonic >= time:

@@ -7,7 +7,7 @@ and the contract test that all devices share.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,7 @@ class Frame:
     wall: float
 
 
+@runtime_checkable
 class ShutterCamera(Protocol):
     """A camera whose shutter can be set. Every method raises :class:`DeviceError`."""
 
@@ -48,6 +49,7 @@ class ShutterCamera(Protocol):
         ...
 
 
+@runtime_checkable
 class FrameSource(Protocol):
     """A free-running picture stream. Every method raises :class:`DeviceError`."""
 

@@ -31,7 +31,7 @@ from chromeball.scene.record import read_json
 LOW, HIGH = 12, 243  # codes that are neither noise nor clipped
 ENOUGH = 200  # usable samples, in each field
 RATIO = 0.06  # |r| of a settled frame, by a measured response
-GENERIC = 0.35  # and by the generic curve: this part of ln(t / t_ref) more
+GENERIC = 0.4  # and by the generic curve: this part of ln(t / t_ref) more
 FIELDS = 0.05  # |m_even - m_odd|
 DRIFT = 0.015  # |m_k - m_(k-1)|
 SKIP = 12  # frames to let go by where the pictures cannot tell
@@ -41,17 +41,19 @@ _SAMPLES = 8192  # pixels looked at in each field
 
 @dataclass(frozen=True)
 class Curve:
-    """h: ln exposure (3, 256) for each code, and where it is from."""
+    """h: ln exposure (3, 256) for each code, where it is from, and its lowest usable code."""
 
     log_exposure: NDArray[np.float64]
     origin: Literal["response", "generic"]
+    low: int = LOW
 
 
 def generic_curve() -> Curve:
     """The sRGB curve, in place of an unknown camera's."""
     codes = np.maximum(np.arange(256), 0.5) / 255
     h = np.log(np.asarray(srgb_decode(codes), np.float64))
-    return Curve(np.repeat((h - h[128])[None], 3, axis=0), "generic")
+    # Cameras differ most in the dark: what they make of black is left out.
+    return Curve(np.repeat((h - h[128])[None], 3, axis=0), "generic", low=32)
 
 
 def read_curve(path: str | os.PathLike[str]) -> Curve:
@@ -124,10 +126,10 @@ def compare(
             z = before[:, channel]
             # Usable in the reference, and, as it predicts, at the new time as well: choosing
             # by the frame itself would favour pixels that noise has pushed inside.
-            low, high = h[LOW], h[HIGH]
+            low, high = h[curve.low], h[HIGH]
             predicted = h + expected
             usable = (h >= low) & (h <= high) & (predicted >= low) & (predicted <= high)
-            usable[:LOW] = usable[HIGH + 1 :] = False
+            usable[: curve.low] = usable[HIGH + 1 :] = False
             chosen = usable[z]
             differences.append(h[now[chosen, channel]] - h[z[chosen]])
         joined = np.concatenate(differences)
@@ -216,10 +218,21 @@ class Watch:
         return step == 0 or (now.measured - old) / step > 0.5
 
     def _choose(self) -> Reference | None:
-        """The reference with most samples that are usable at both times."""
-        counts = [compare(r.samples, self.time, r, self.curve).count for r in self.references]
-        best = max(counts, default=0)
-        return self.references[counts.index(best)] if best >= ENOUGH else None
+        """The reference with most samples that are usable at both times.
+
+        By the generic curve ln(t / t_ref) may be wrong by a part of itself, so a reference far
+        from the old exposure cannot tell that from the new one: the old one itself is best.
+        """
+        step = abs(math.log(self.time / self.before))
+        best, most = None, ENOUGH - 1
+        for reference in self.references:
+            far = abs(math.log(self.before / reference.time))
+            if self.curve.origin == "generic" and far and GENERIC * far > step / 4:
+                continue
+            count = compare(reference.samples, self.time, reference, self.curve).count
+            if count > most:
+                best, most = reference, count
+        return best
 
     def _skip(self, frame: Frame) -> Outcome:
         assert self._first is not None

@@ -11,8 +11,8 @@ import numpy as np
 from chromeball.acquire.devices import Frame
 from chromeball.scene.errors import DeviceError, UserError
 
-#: A frame on the socket: magic, sequence number, monotonic seconds, height, width, then the
-#: (H, W, 3) uint8 pixels. Little endian.
+#: The client sends a byte for each frame that it wants. A frame on the socket: magic, sequence
+#: number, monotonic seconds, height, width, then the (H, W, 3) uint8 pixels. Little endian.
 HEADER = struct.Struct("<4sQdII")
 MAGIC = b"CBv1"
 
@@ -36,7 +36,8 @@ class SocketSource:
             ) from error
 
     def grab(self) -> Frame:
-        """The newest picture the emulator has sent."""
+        """The next picture that the emulated camera exposes."""
+        self._ask()
         magic, sequence, monotonic, height, width = HEADER.unpack(self._read(HEADER.size))
         if magic != MAGIC or sequence <= self._sequence or not 0 < height * width <= 2**28:
             raise DeviceError("the video stream is damaged; start it again", file=self._path)
@@ -50,6 +51,14 @@ class SocketSource:
         """Close the socket."""
         self._socket.close()
 
+    def _ask(self) -> None:
+        try:
+            self._socket.sendall(b"n")
+        except OSError as error:
+            raise DeviceError(
+                f"the video broke off: {error.strerror}", file=self._path
+            ) from error
+
     def _read(self, count: int) -> bytearray:
         data = bytearray(count)
         view, filled = memoryview(data), 0
@@ -59,7 +68,9 @@ class SocketSource:
             except TimeoutError as error:
                 raise DeviceError("the video stands still", file=self._path) from error
             except OSError as error:
-                raise DeviceError(f"the video broke off: {error}", file=self._path) from error
+                raise DeviceError(
+                    f"the video broke off: {error.strerror}", file=self._path
+                ) from error
             if not got:
                 raise DeviceError("the video ended", file=self._path)
             filled += got

@@ -1,7 +1,8 @@
 """The video side of an emulated camera: a free-running stream on a unix socket.
 
-Every client is sent the newest frame once it has taken the one before; what it is too slow
-for, it misses. The frames' layout is that of :data:`chromeball.acquire.video.HEADER`.
+A client asks with a byte and is sent the next frame that is exposed; what it does not ask for
+in time, it misses, so nothing stale waits in a buffer. The frames' layout is that of
+:data:`chromeball.acquire.video.HEADER`.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from chromeball.scene.errors import UserError
 @dataclass
 class _Client:
     socket: socket.socket
+    asks: bool = False
     unsent: list[memoryview] = field(default_factory=list[memoryview])
 
 
@@ -75,7 +77,7 @@ class VideoServer:
             now = time.monotonic()
             if now < due:
                 for key, _ in self._selector.select(due - now):
-                    self._accept() if key.data is None else self._send(key.data)
+                    self._accept() if key.data is None else self._serve(key.data)
                 continue
             sequence += 1
             self._frame(sequence)
@@ -83,7 +85,7 @@ class VideoServer:
             due = max(due + self._period, time.monotonic() - self._period)
 
     def _frame(self, sequence: int) -> None:
-        ready = [client for client in self._clients if not client.unsent]
+        ready = [client for client in self._clients if client.asks and not client.unsent]
         monotonic = time.monotonic()
         pixels = self.camera.tick(monotonic, wanted=bool(ready))
         if pixels is None:
@@ -91,6 +93,7 @@ class VideoServer:
         height, width, _ = pixels.shape
         header = HEADER.pack(MAGIC, sequence, monotonic, height, width)
         for client in ready:
+            client.asks = False
             client.unsent = [memoryview(header), memoryview(pixels.reshape(-1))]
             self._selector.modify(client.socket, selectors.EVENT_WRITE, client)
             self._send(client)
@@ -98,15 +101,23 @@ class VideoServer:
     def _accept(self) -> None:
         connection, _ = self._listener.accept()
         connection.setblocking(False)
-        connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 16)
         client = _Client(connection)
         self._clients.append(client)
         self._selector.register(connection, selectors.EVENT_READ, client)
 
+    def _serve(self, client: _Client) -> None:
+        if client.unsent:
+            self._send(client)
+            return
+        try:
+            client.asks = bool(client.socket.recv(64))
+        except OSError:
+            client.asks = False
+        if not client.asks:  # it went away
+            self._drop(client)
+
     def _send(self, client: _Client) -> None:
         try:
-            if not client.unsent and not client.socket.recv(1):
-                raise BrokenPipeError
             while client.unsent:
                 sent = client.socket.send(client.unsent[0])
                 client.unsent[0] = client.unsent[0][sent:]
@@ -115,7 +126,10 @@ class VideoServer:
             self._selector.modify(client.socket, selectors.EVENT_READ, client)
         except BlockingIOError:
             return
-        except OSError:  # the client went away
-            self._selector.unregister(client.socket)
-            client.socket.close()
-            self._clients.remove(client)
+        except OSError:
+            self._drop(client)
+
+    def _drop(self, client: _Client) -> None:
+        self._selector.unregister(client.socket)
+        client.socket.close()
+        self._clients.remove(client)

@@ -176,7 +176,8 @@ class ViscaPort:
         if silent is not None and self.answered >= silent:
             return
         self.answered += 1
-        self._answer(packet, now + cycle)
+        # A completion takes about a cycle, so two commands may be under way at once.
+        self._answer(packet, now + cycle * self._rng.uniform(0.8, 1.2))
 
     def _finish(self) -> None:
         now = time.monotonic()
