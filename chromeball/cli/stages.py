@@ -404,7 +404,8 @@ class _Planner:
         name = "envmap align"
         align, probe = self.scene.align, self.scene.probe
         if align is None:
-            return StagePlan(name, False, "no [align]: the first shot's axes are the world's")
+            whose = "panorama's" if self.scene.env.file else "first shot's"
+            return StagePlan(name, False, f"no [align]: the {whose} axes are the world's")
         picture = self._env() if align.picture == "env" else f"{self.build}/{align.picture}.exr"
         inputs = [picture]
         if probe and probe.camera and align.picture != "env":

@@ -261,6 +261,7 @@ def test_sorting_figures() -> None:
             "bad_pixels": 3,
             "median_pixels": 0.5,
             "peak_bytes": 3 * 2**20,
+            "distance_min": 1.5,
             "size": [640, 480],
             "lens": {"focal_m": 0.05, "plot": "a.PNG"},
             "curve": list(range(20)),
@@ -274,6 +275,7 @@ def test_sorting_figures() -> None:
         Row("bad pixels", "3", ""),
         Row("median", "0.5", "px"),
         Row("peak", "3", "MB"),
+        Row("distance min", "1.5", "m"),
         Row("size", "640 \u00d7 480", ""),
         Row("lens · focal", "0.05", "m"),
     )

@@ -33,6 +33,8 @@ UNITS = {
     "ms": "ms",
     "hz": "Hz",
 }
+#: first words of a figure's name -> the unit of what has only one here
+QUANTITIES = {"solid_angle": "sr", "distance_": "m", "area_": "m\u00b2", "origin": "m"}
 #: more numbers than these are no key figure
 SHORT = 6
 
@@ -107,6 +109,8 @@ def sort_figures(figures: Mapping[str, Any]) -> Figures:
                 unit = "px"  # a count of pixels is an integer
                 words[-1] = "px"
             text = label.removesuffix("_" + name.split("_")[-1]) if unit else label
+            if not unit:
+                unit = next((u for word, u in QUANTITIES.items() if name.startswith(word)), "")
             if unit == "B" and isinstance(value, int | float):
                 value, unit = value / 2**20, "MB"
             if name == "size" and isinstance(value, list):
