@@ -30,7 +30,7 @@ class LitSet:
     near: float
 
     def with_mesh(self, mesh: Mesh) -> LitSet:
-        """The same light with one more mesh; what it does to the light of the rest is ignored."""
+        """The same light with one more mesh, which leaves the light of the rest as it is."""
         unknown = np.full((len(mesh.vertices), 3), np.nan, np.float32)
         return replace(
             self,

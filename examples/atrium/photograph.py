@@ -14,6 +14,7 @@ import argparse
 import math
 import sys
 import time
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -59,7 +60,7 @@ def board(target: Charuco, pose: Pose) -> Mesh:
     white: list[bool] = []
     for y, row in enumerate(cells):
         edges = np.flatnonzero(np.diff(row, prepend=~row[0], append=~row[-1]))
-        for x0, x1 in zip(edges[:-1], edges[1:], strict=True):
+        for x0, x1 in pairwise(edges):
             corners.append(
                 np.array([[x0, y + 1, 0], [x1, y + 1, 0], [x1, y, 0], [x0, y, 0]]) * side
             )
@@ -117,7 +118,7 @@ def photograph(folder: Path, samples: int, probe_size: int) -> None:
 
     for name in PROBE_YAWS:
         camera = probe_camera(name, probe_size)
-        write_exr(folder / "set" / f"{name}.exr", radiance(empty, camera, samples // 2))
+        write_exr(folder / "set" / f"{name}.exr", radiance(empty, camera, samples // 4))
         say(f"set/{name}.exr")
 
     plate = radiance(empty, view, samples)
@@ -127,7 +128,7 @@ def photograph(folder: Path, samples: int, probe_size: int) -> None:
     target = parse_target(scene.calibrate.target if scene.calibrate else None)
     assert isinstance(target, Charuco)
     for i, pose in enumerate(board_poses(view, BOARD_VIEWS)):
-        picture = radiance(empty.with_mesh(board(target, pose)), view, max(4, samples // 16))
+        picture = radiance(empty.with_mesh(board(target, pose)), view, max(4, samples // 32))
         codes = SENSOR.expose(picture, 1 / 25, rng)
         write_picture(folder / f"photographs/board_{i:02d}.png", codes)
     say("photographs/board_*.png")
@@ -140,7 +141,7 @@ def photograph(folder: Path, samples: int, probe_size: int) -> None:
     say("truth/objects_*.png, the photographs with the objects")
 
     around = CameraModel.latlong((512, 256), Pose(WORLD_FROM_LATLONG.rotation, PROBE_PLACE))
-    write_exr(folder / "truth/env.exr", radiance(empty, around, samples // 2))
+    write_exr(folder / "truth/env.exr", radiance(empty, around, samples // 4))
     view.write(folder / "truth/view.cameramodel")
     front = probe_camera("front", probe_size)
     front.write(folder / "truth/front.cameramodel")
@@ -164,7 +165,7 @@ if __name__ == "__main__":
         "--samples",
         type=int,
         default=128,
-        help="paths a pixel of the view camera; the probe takes half",
+        help="paths a pixel of the view camera; the probe takes a quarter",
     )
     parser.add_argument("--probe-size", type=int, default=1280, help="pixels of the probe")
     arguments = parser.parse_args()
