@@ -1,0 +1,349 @@
+"""Corners of a target in photographs, each with its identity, to a small part of a pixel.
+
+A chessboard is found whole: the classic detector, the sector-based one where that fails. Of a
+ChArUco board any part is enough; corners whose markers were not read are predicted from their
+neighbours and kept if the picture shows the right corner there. Refinement is Foerstner's
+gradient method in a window scaled to the local pitch, small enough on a ChArUco board to stay
+clear of the markers.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from chromeball.calibrate.target import Charuco, Chessboard, Target
+from chromeball.scene.errors import UserError
+from chromeball.scene.image import Image, read_image, to_display
+
+#: Half of the refinement window in pitches; a ChArUco marker starts at about .12 of it.
+CHESSBOARD_WINDOW = 0.30
+CHARUCO_WINDOW = 0.10
+#: Fewest corners that place a board well enough to be worth a view.
+FEWEST = 8
+#: Larger pictures are searched at this width first; refinement is always at full size.
+SEARCH_WIDTH = 1600
+
+
+@dataclass(frozen=True)
+class Detection:
+    """What one picture shows of the target.
+
+    ``corners`` is (rows, columns, 2) in pixels, NaN where not found; ``size`` is width and
+    height; ``blur`` the standard deviation of the edges' spread in pixels, NaN without a board;
+    ``usable`` says that the view may enter a calibration, ``verdict`` why or why not.
+    """
+
+    file: Path
+    size: tuple[int, int]
+    corners: NDArray[np.float64]
+    blur: float
+    usable: bool
+    verdict: str
+
+    @property
+    def count(self) -> int:
+        """How many corners were found."""
+        return int(np.isfinite(self.corners[..., 0]).sum())
+
+
+def detect_files(
+    files: Sequence[str | os.PathLike[str]],
+    target: Target,
+    progress: Callable[[Detection], object] | None = None,
+) -> list[Detection]:
+    """Look for `target` in every picture; `progress` hears of each.
+
+    Raises
+    ------
+    UserError
+        When a picture cannot be read, the sizes differ, or no picture shows the board.
+
+    """
+    detections: list[Detection] = []
+    for file in files:
+        image = read_image(file)
+        if detections and image.size != detections[0].size:
+            raise UserError(
+                "this picture is {}x{}, {} is {}x{}: pictures of one lens have one size".format(
+                    *image.size, detections[0].file, *detections[0].size
+                ),
+                file=file,
+            )
+        detection = judge(Path(file), grey(image), target)
+        detections.append(detection)
+        if progress is not None:
+            progress(detection)
+    if not any(detection.usable for detection in detections):
+        names = (
+            detections[0].file if len(detections) == 1 else f"any of {len(detections)} pictures"
+        )
+        raise UserError(
+            f"the board {target.spec} was not seen in {names}: "
+            "check its counts (a chessboard's are inner corners), focus and light"
+        )
+    return detections
+
+
+def judge(file: Path, picture: NDArray[np.uint8], target: Target) -> Detection:
+    """Detect in one grey picture and say what came of it."""
+    size = (picture.shape[1], picture.shape[0])
+    corners = detect(picture, target)
+    found = np.argwhere(np.isfinite(corners[..., 0]))
+    if not len(found):
+        return Detection(file, size, corners, float("nan"), False, "no board")
+    blur = measure_blur(picture, corners, target)
+    verdict = f"{len(found)} of {target.rows * target.columns} corners, blur {blur:.1f} px"
+    spread = np.linalg.matrix_rank(found - found.mean(axis=0)) if len(found) > 1 else 0
+    if len(found) < FEWEST or spread < 2:
+        reason = "too few" if len(found) < FEWEST else "all in a line"
+        return Detection(file, size, corners, blur, False, f"{verdict}: {reason}")
+    return Detection(file, size, corners, blur, True, verdict)
+
+
+def grey(image: Image) -> NDArray[np.uint8]:
+    """8-bit luma, (H, W); linear pictures are encoded, their 99th percentile near white."""
+    pixels: NDArray[Any] = image.pixels[..., : 3 if image.pixels.shape[2] >= 3 else 1]
+    if image.linear:
+        linear = np.nan_to_num(pixels.astype(np.float32), posinf=0, neginf=0)
+        codes = to_display(linear, 0.9 / max(float(np.percentile(linear, 99)), 1e-12))
+    elif pixels.dtype == np.uint16:
+        codes = np.round(pixels / 257.0).astype(np.uint8)
+    else:
+        codes = pixels
+    if codes.shape[2] == 1:
+        return np.ascontiguousarray(codes[..., 0])
+    return np.asarray(cv2.cvtColor(np.ascontiguousarray(codes), cv2.COLOR_RGB2GRAY), np.uint8)
+
+
+def detect(picture: NDArray[np.uint8], target: Target) -> NDArray[np.float64]:
+    """Corners of `target` in a grey picture, (rows, columns, 2), NaN where not found."""
+    if isinstance(target, Chessboard):
+        return _detect_chessboard(picture, target)
+    return _detect_charuco(picture, target)
+
+
+def measure_blur(
+    picture: NDArray[np.uint8], corners: NDArray[np.float64], target: Target
+) -> float:
+    """Spread of the squares' edges, one standard deviation in pixels, median over the board.
+
+    A step blurred by a Gaussian has contrast / largest slope = sqrt(2 pi) sigma.
+    """
+    reach = 0.35 if isinstance(target, Chessboard) else _margin(target) * 0.9
+    sigmas: list[float] = []
+    for a, b in ((corners[:, :-1], corners[:, 1:]), (corners[:-1], corners[1:])):
+        middle, along = (a + b) / 2, b - a
+        length = np.linalg.norm(along, axis=-1)
+        for m, d, n in zip(
+            middle.reshape(-1, 2), along.reshape(-1, 2), length.ravel(), strict=True
+        ):
+            if not np.isfinite(n) or n < 8:
+                continue
+            half = min(reach * n, 20.0)
+            s = np.arange(-half, half + 0.125, 0.25)
+            normal = np.array([-d[1], d[0]]) / n
+            profile = _sample(picture, m + s[:, None] * normal)
+            slope = np.abs(np.diff(profile)).max() / 0.25
+            contrast = np.ptp(profile)
+            if contrast > 16:
+                sigmas.append(float(contrast / (np.sqrt(2 * np.pi) * slope)))
+    return float(np.median(sigmas)) if sigmas else float("nan")
+
+
+# ---- chessboard
+
+
+def _detect_chessboard(picture: NDArray[np.uint8], target: Chessboard) -> NDArray[np.float64]:
+    count = (target.columns, target.rows)
+    missing = np.full((target.rows, target.columns, 2), np.nan)
+    for factor in _search_scales(picture):
+        small = _shrink(picture, factor)
+        found, corners = cv2.findChessboardCorners(
+            small, count, flags=cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+        )
+        if not found:
+            found, corners = cv2.findChessboardCornersSB(
+                small, count, flags=cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
+            )
+        if found:
+            grid = corners.reshape(target.rows, target.columns, 2).astype(float)
+            return _refine(picture, (grid + 0.5) / factor - 0.5, CHESSBOARD_WINDOW)
+    return missing
+
+
+def _search_scales(picture: NDArray[np.uint8]) -> list[float]:
+    width = max(picture.shape)
+    return [1.0] if width <= SEARCH_WIDTH else [SEARCH_WIDTH / width, 1.0]
+
+
+def _shrink(picture: NDArray[np.uint8], factor: float) -> NDArray[Any]:
+    if factor == 1:
+        return picture
+    return cv2.resize(picture, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
+
+
+# ---- ChArUco
+
+
+def _detect_charuco(picture: NDArray[np.uint8], target: Charuco) -> NDArray[np.float64]:
+    grid = np.full((target.rows, target.columns, 2), np.nan)
+    corners, ids = _read_markers(picture, target)
+    if ids is None or len(ids) < 4:
+        return grid
+    grid.reshape(-1, 2)[ids.ravel()] = corners.reshape(-1, 2)
+    grid = _keep_true(picture, _refine(picture, grid, CHARUCO_WINDOW), target)
+    while True:
+        guess = _predict_missing(grid)
+        new = np.isfinite(guess[..., 0])
+        if not new.any():
+            return grid
+        merged = _refine(picture, np.where(new[..., None], guess, grid), CHARUCO_WINDOW)
+        merged = _keep_true(picture, np.where(new[..., None], merged, grid), target)
+        if np.isfinite(merged[..., 0]).sum() <= np.isfinite(grid[..., 0]).sum():
+            return grid
+        grid = merged
+
+
+def _read_markers(picture: NDArray[np.uint8], target: Charuco) -> tuple[Any, Any]:
+    """OpenCV's ChArUco detector, tuned to keep blurred, small and partly hidden markers."""
+    aruco: Any = cv2.aruco
+    search = aruco.DetectorParameters()
+    search.adaptiveThreshWinSizeMin = 5
+    search.adaptiveThreshWinSizeMax = max(25, min(picture.shape) // 12 | 1)
+    search.adaptiveThreshWinSizeStep = max(8, (search.adaptiveThreshWinSizeMax - 5) // 5)
+    search.minMarkerPerimeterRate = 0.01
+    search.polygonalApproxAccuracyRate = 0.05
+    search.minOtsuStdDev = 3.0
+    search.perspectiveRemovePixelPerCell = 8
+    search.perspectiveRemoveIgnoredMarginPerCell = 0.25
+    corner = aruco.CharucoParameters()
+    corner.minMarkers = 1
+    corner.tryRefineMarkers = True
+    detector = aruco.CharucoDetector(target.board(), corner, search)
+    corners, ids, _, _ = detector.detectBoard(picture)
+    return corners, ids
+
+
+def _margin(target: Charuco) -> float:
+    """White rim between a square's edge and its marker, in squares."""
+    return (target.square - target.marker) / 2 / target.square
+
+
+def _neighbourhood(
+    grid: NDArray[np.float64], row: int, column: int, least: int
+) -> NDArray[np.float64] | None:
+    """Homography from (column, row, 1) to pixels by the nearest found corners but this one."""
+    found = np.argwhere(np.isfinite(grid[..., 0]))
+    distance = np.abs(found - [row, column]).max(axis=1)
+    found = found[(distance > 0) & (distance <= 3)]
+    distance = np.hypot(*(found - [row, column]).T)
+    near = found[np.argsort(distance, kind="stable")[:12]]
+    if len(near) < least or np.linalg.matrix_rank(near - near.mean(axis=0)) < 2:
+        return None
+    h, _ = cv2.findHomography(near[:, ::-1].astype(float), grid[near[:, 0], near[:, 1]])
+    return None if h is None else np.asarray(h, float)
+
+
+def _through(h: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
+    mapped = np.column_stack([points, np.ones(len(points))]) @ h.T
+    return mapped[:, :2] / mapped[:, 2:]
+
+
+def _predict_missing(grid: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Where missing corners with found neighbours should be; NaN elsewhere."""
+    guess = np.full_like(grid, np.nan)
+    for row, column in np.argwhere(np.isnan(grid[..., 0])):
+        h = _neighbourhood(grid, row, column, least=6)
+        if h is not None:
+            guess[row, column] = _through(h, np.array([[column, row]], float))[0]
+    return guess
+
+
+def _keep_true(
+    picture: NDArray[np.uint8], grid: NDArray[np.float64], target: Charuco
+) -> NDArray[np.float64]:
+    """Without corners that leave their neighbours' grid or do not look like themselves.
+
+    Right in the white rim of its squares a corner must show dark, bright, dark, bright in the
+    order that its place on the board demands.
+    """
+    kept = grid.copy()
+    reach = _margin(target) * 0.7
+    height, width = picture.shape
+    low, high = np.percentile(picture, [2, 98])
+    for row, column in np.argwhere(np.isfinite(grid[..., 0])):
+        h = _neighbourhood(grid, row, column, least=4)
+        if h is None:
+            continue
+        place = np.array([column, row], float)
+        here = _through(h, place[None])[0]
+        ring = _through(h, place + reach * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]))
+        pitch = np.linalg.norm(ring[0] - ring[2]) / (2 * np.sqrt(2) * reach)
+        ring += grid[row, column] - here
+        inside = (ring >= 0).all() and (ring <= [width - 1, height - 1]).all()
+        shades = _sample(picture, ring) if inside else np.zeros(4)
+        dark, bright = (
+            (shades[0::2], shades[1::2])
+            if (row + column) % 2 == 0
+            else (
+                shades[1::2],
+                shades[0::2],
+            )
+        )
+        shows = inside and bright.min() - dark.max() > 0.1 * (high - low)
+        if not shows or np.linalg.norm(here - grid[row, column]) > 0.2 * pitch:
+            kept[row, column] = np.nan
+    return kept
+
+
+# ---- common
+
+
+def _refine(
+    picture: NDArray[np.uint8], grid: NDArray[np.float64], window: float
+) -> NDArray[np.float64]:
+    """Foerstner's corner, `window` local pitches (2 to 15 pixels) to each side."""
+    refined = grid.copy()
+    height, width = picture.shape
+    found = np.isfinite(grid[..., 0]) & (grid > 0).all(axis=-1)
+    found &= (grid < [width - 1, height - 1]).all(axis=-1)
+    refined[~found] = np.nan
+    half = np.clip(np.round(window * _pitch(grid)), 2, 15).astype(int)
+    stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 60, 1e-3)
+    for w in np.unique(half[found]):
+        chosen = found & (half == w)
+        points = np.ascontiguousarray(grid[chosen], np.float32).reshape(-1, 1, 2)
+        result = cv2.cornerSubPix(picture, points, (int(w), int(w)), (-1, -1), stop)
+        refined[chosen] = np.asarray(result, float).reshape(-1, 2)
+    return refined
+
+
+def _pitch(grid: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Distance to the nearest found neighbour in the row or column, the median where none."""
+    nearest = np.full(grid.shape[:2], np.inf)
+    across = np.linalg.norm(np.diff(grid, axis=1), axis=-1)
+    down = np.linalg.norm(np.diff(grid, axis=0), axis=-1)
+    for gap, sides in (
+        (across, (nearest[:, :-1], nearest[:, 1:])),
+        (down, (nearest[:-1], nearest[1:])),
+    ):
+        for side in sides:
+            np.fmin(side, gap, out=side)
+    known = np.isfinite(nearest)
+    typical = float(np.median(nearest[known])) if known.any() else 20.0
+    return np.where(known, nearest, typical)
+
+
+def _sample(picture: NDArray[np.uint8], points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Bilinear values at (N, 2) pixels."""
+    x, y = (np.ascontiguousarray(points[:, i : i + 1], np.float32) for i in range(2))
+    values = cv2.remap(picture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(values, float).ravel()

@@ -1,0 +1,154 @@
+"""Detectors against virtual photographs whose corners are known, and against bad input."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from chromeball.calibrate.detect import detect, detect_files, grey, judge, measure_blur
+from chromeball.calibrate.target import Charuco, Chessboard, Target, parse_target
+from chromeball.calibrate.virtual import board_poses, photograph, project
+from chromeball.scene.camera import CameraModel
+from chromeball.scene.errors import UserError
+from chromeball.scene.image import Image, write_exr, write_picture
+
+CHESSBOARD = Chessboard(9, 6, 0.025)
+CHARUCO = Charuco(9, 6, 0.04, 0.03, "4X4_50")
+CAMERA = CameraModel(
+    "LENSMODEL_OPENCV4",
+    np.array([520.0, 523, 331, 228, -0.24, 0.09, 0.001, -0.0008]),
+    (640, 480),
+)
+
+
+@pytest.mark.parametrize("target", [CHESSBOARD, CHARUCO], ids=["chessboard", "charuco"])
+@pytest.mark.parametrize(
+    ("blur", "bound"), [(0.6, 0.06), (1.2, 0.06), (2.0, 0.12)], ids=["sharp", "soft", "blurred"]
+)
+def test_corners(target: Target, blur: float, bound: float) -> None:
+    """Every corner with its identity, RMS of `bound` pixels, and the blur to a quarter."""
+    poses = board_poses(target, CAMERA, 4, seed=3)
+    truth = project(target, CAMERA, poses)
+    errors: list[NDArray[np.float64]] = []
+    for i, pose in enumerate(poses):
+        picture = photograph(target, CAMERA, pose, blur=blur, seed=i)
+        corners = detect(picture, target)
+        assert np.isfinite(corners).all()
+        if isinstance(target, Chessboard) and np.abs(corners - truth[i]).max() > 5:
+            corners = corners[::-1, ::-1]  # a chessboard does not tell its two ends
+        errors.append(np.linalg.norm(corners - truth[i], axis=-1))
+        assert measure_blur(picture, corners, target) == pytest.approx(
+            np.hypot(blur, 0.4), rel=0.25
+        )
+    assert np.sqrt(np.mean(np.square(errors))) < bound
+    assert np.max(errors) < 5 * bound
+
+
+def test_half_hidden_charuco() -> None:
+    """What is hidden is missing, what is seen has the right identity."""
+    pose = board_poses(CHARUCO, CAMERA, 1, seed=5, size=0.7)[0]
+    truth = project(CHARUCO, CAMERA, [pose])[0]
+    picture = photograph(CHARUCO, CAMERA, pose)
+    edge = int(truth[:, 4, 0].mean())
+    picture[:, edge:] = 70
+    corners = detect(picture, CHARUCO)
+    found = np.isfinite(corners[..., 0])
+    assert not found[truth[..., 0] > edge + 2].any()
+    assert found[truth[..., 0] < edge - 15].all()
+    assert np.abs(corners - truth)[found].max() < 0.3
+
+
+def test_large_picture_is_searched_small() -> None:
+    camera = CAMERA.scaled(4)
+    pose = board_poses(CHESSBOARD, camera, 1, seed=2)[0]
+    truth = project(CHESSBOARD, camera, [pose])[0]
+    corners = detect(photograph(CHESSBOARD, camera, pose, blur=1.5), CHESSBOARD)
+    error = min(np.abs(c - truth).max() for c in (corners, corners[::-1, ::-1]))
+    assert error < 0.25
+
+
+def test_kinds_of_picture_agree() -> None:
+    """8 and 16 bits, RGB, alpha and scene-linear radiance show the same corners."""
+    pose = board_poses(CHARUCO, CAMERA, 1)[0]
+    codes = photograph(CHARUCO, CAMERA, pose)[..., None]
+    expected = detect(codes[..., 0], CHARUCO)
+    alpha = np.full_like(codes, 255)
+    linear = (codes / np.float32(255)) ** np.float32(2.2) * 40
+    for pixels, is_linear in (
+        (codes.astype(np.uint16) * 257, False),
+        (np.repeat(codes, 3, axis=2), False),
+        (np.concatenate([codes, alpha], axis=2), False),
+        (linear, True),
+    ):
+        channels = tuple("RGBA"[: pixels.shape[2]])
+        picture = grey(Image(pixels=pixels, linear=is_linear, channels=channels))
+        found = detect(picture, CHARUCO)
+        assert np.isfinite(found).all()
+        assert np.abs(found - expected).max() < 0.1
+
+
+def test_no_board_is_invented() -> None:
+    rng = np.random.default_rng(0)
+    for picture in (
+        np.full((240, 320), 128, np.uint8),
+        rng.integers(0, 256, (240, 320)).astype(np.uint8),
+        np.zeros((3, 3), np.uint8),
+    ):
+        for target in (CHESSBOARD, CHARUCO):
+            detection = judge(Path("x.png"), picture, target)
+            assert not detection.usable
+            assert detection.verdict == "no board"
+            assert np.isnan(detection.corners).all()
+
+
+def test_too_few_corners_are_named() -> None:
+    pose = board_poses(CHARUCO, CAMERA, 1, seed=5, size=0.7)[0]
+    truth = project(CHARUCO, CAMERA, [pose])[0]
+    picture = photograph(CHARUCO, CAMERA, pose)
+    picture[:, int(truth[:, 1, 0].max()) + 6 :] = 70
+    detection = judge(Path("x.png"), picture, CHARUCO)
+    assert not detection.usable or detection.count >= 8
+    picture[:, int(truth[:, 0, 0].max()) + 6 :] = 70
+    detection = judge(Path("x.png"), picture, CHARUCO)
+    assert not detection.usable
+
+
+def write(path: Path, picture: NDArray[Any]) -> Path:
+    write_picture(path, picture)
+    return path
+
+
+def test_files(tmp_path: Path) -> None:
+    pose = board_poses(CHARUCO, CAMERA, 1)[0]
+    codes = photograph(CHARUCO, CAMERA, pose)
+    files = [
+        write(tmp_path / "board.png", codes),
+        write(tmp_path / "nothing.png", np.full_like(codes, 90)),
+        tmp_path / "radiance.exr",
+    ]
+    write_exr(files[2], (codes[..., None].repeat(3, axis=2) / 255.0) ** 2.2)
+    heard: list[str] = []
+    detections = detect_files(files, CHARUCO, lambda d: heard.append(d.verdict))
+    assert [d.usable for d in detections] == [True, False, True]
+    assert heard[0].startswith("40 of 40 corners, blur 0.")
+    assert heard[1] == "no board"
+
+
+def test_bad_files(tmp_path: Path) -> None:
+    plain = np.full((120, 160), 90, np.uint8)
+    files = [write(tmp_path / f"{i}.png", plain) for i in range(3)]
+    with pytest.raises(UserError, match=r"chessboard:9x6:0\.025 was not seen in any of 3 pic"):
+        detect_files(files, parse_target("chessboard:9x6:0.025"))
+    other = write(tmp_path / "other.png", plain[:100])
+    with pytest.raises(UserError, match=r"this picture is 160x100, .*0\.png is 160x120"):
+        detect_files([*files, other], CHESSBOARD)
+    with pytest.raises(UserError, match="no such picture"):
+        detect_files([tmp_path / "missing.png"], CHESSBOARD)
+    broken = tmp_path / "broken.png"
+    broken.write_bytes(files[0].read_bytes()[:60])
+    with pytest.raises(UserError, match=r"broken\.png"):
+        detect_files([broken], CHESSBOARD)
