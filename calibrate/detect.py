@@ -2,9 +2,9 @@
 
 A chessboard is found whole: the classic detector, the sector-based one where that fails. Of a
 ChArUco board any part is enough; corners whose markers were not read are predicted from their
-neighbours and kept if the picture shows the right corner there. Refinement is Foerstner's
-gradient method in a window scaled to the local pitch, small enough on a ChArUco board to stay
-clear of the markers.
+neighbours and kept if the picture shows the board there. A chessboard's corners are refined by
+Foerstner's gradient method in a window scaled to the local pitch, a ChArUco board's by fitting
+the rendered board (:mod:`chromeball.calibrate.patch`).
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from chromeball.calibrate.patch import BLURS, LEAST_CORRELATION, Board, fit_corner
 from chromeball.calibrate.target import Charuco, Chessboard, Target
 from chromeball.scene.errors import UserError
 from chromeball.scene.image import Image, read_image, to_display
 
-#: Half of the refinement window in pitches; a ChArUco marker starts at about .12 of it.
-CHESSBOARD_WINDOW = 0.30
-CHARUCO_WINDOW = 0.10
+#: Half of the refinement window on a chessboard, in pitches.
+WINDOW = 0.30
 #: Fewest corners that place a board well enough to be worth a view.
 FEWEST = 8
 #: Larger pictures are searched at this width first; refinement is always at full size.
@@ -95,11 +95,10 @@ def detect_files(
 def judge(file: Path, picture: NDArray[np.uint8], target: Target) -> Detection:
     """Detect in one grey picture and say what came of it."""
     size = (picture.shape[1], picture.shape[0])
-    corners = detect(picture, target)
+    corners, blur = detect_with_blur(picture, target)
     found = np.argwhere(np.isfinite(corners[..., 0]))
     if not len(found):
         return Detection(file, size, corners, float("nan"), False, "no board")
-    blur = measure_blur(picture, corners, target)
     verdict = f"{len(found)} of {target.rows * target.columns} corners, blur {blur:.1f} px"
     spread = np.linalg.matrix_rank(found - found.mean(axis=0)) if len(found) > 1 else 0
     if len(found) < FEWEST or spread < 2:
@@ -125,37 +124,19 @@ def grey(image: Image) -> NDArray[np.uint8]:
 
 def detect(picture: NDArray[np.uint8], target: Target) -> NDArray[np.float64]:
     """Corners of `target` in a grey picture, (rows, columns, 2), NaN where not found."""
-    if isinstance(target, Chessboard):
-        return _detect_chessboard(picture, target)
-    return _detect_charuco(picture, target)
+    return detect_with_blur(picture, target)[0]
 
 
-def measure_blur(
-    picture: NDArray[np.uint8], corners: NDArray[np.float64], target: Target
-) -> float:
-    """Spread of the squares' edges, one standard deviation in pixels, median over the board.
-
-    A step blurred by a Gaussian has contrast / largest slope = sqrt(2 pi) sigma.
-    """
-    reach = 0.35 if isinstance(target, Chessboard) else _margin(target) * 0.9
-    sigmas: list[float] = []
-    for a, b in ((corners[:, :-1], corners[:, 1:]), (corners[:-1], corners[1:])):
-        middle, along = (a + b) / 2, b - a
-        length = np.linalg.norm(along, axis=-1)
-        for m, d, n in zip(
-            middle.reshape(-1, 2), along.reshape(-1, 2), length.ravel(), strict=True
-        ):
-            if not np.isfinite(n) or n < 8:
-                continue
-            half = min(reach * n, 20.0)
-            s = np.arange(-half, half + 0.125, 0.25)
-            normal = np.array([-d[1], d[0]]) / n
-            profile = _sample(picture, m + s[:, None] * normal)
-            slope = np.abs(np.diff(profile)).max() / 0.25
-            contrast = np.ptp(profile)
-            if contrast > 16:
-                sigmas.append(float(contrast / (np.sqrt(2 * np.pi) * slope)))
-    return float(np.median(sigmas)) if sigmas else float("nan")
+def detect_with_blur(
+    picture: NDArray[np.uint8], target: Target
+) -> tuple[NDArray[np.float64], float]:
+    """As :func:`detect`, and the spread of edges, one standard deviation in pixels."""
+    if min(picture.shape) < 24:  # the detectors' filters need some room
+        return np.full((target.rows, target.columns, 2), np.nan), np.nan
+    if isinstance(target, Charuco):
+        return _detect_charuco(picture, target)
+    corners = _detect_chessboard(picture, target)
+    return corners, _edge_blur(picture, corners)
 
 
 # ---- chessboard
@@ -175,7 +156,7 @@ def _detect_chessboard(picture: NDArray[np.uint8], target: Chessboard) -> NDArra
             )
         if found:
             grid = corners.reshape(target.rows, target.columns, 2).astype(float)
-            return _refine(picture, (grid + 0.5) / factor - 0.5, CHESSBOARD_WINDOW)
+            return _refine(picture, (grid + 0.5) / factor - 0.5, WINDOW)
     return missing
 
 
@@ -190,26 +171,90 @@ def _shrink(picture: NDArray[np.uint8], factor: float) -> NDArray[Any]:
     return cv2.resize(picture, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
 
 
+def _edge_blur(picture: NDArray[np.uint8], corners: NDArray[np.float64]) -> float:
+    """Spread of the squares' edges, one standard deviation in pixels, median over the board.
+
+    A step blurred by a Gaussian has contrast / largest slope = sqrt(2 pi) sigma.
+    """
+    sigmas: list[float] = []
+    for a, b in ((corners[:, :-1], corners[:, 1:]), (corners[:-1], corners[1:])):
+        middle, along = (a + b) / 2, b - a
+        length = np.linalg.norm(along, axis=-1)
+        for m, d, n in zip(
+            middle.reshape(-1, 2), along.reshape(-1, 2), length.ravel(), strict=True
+        ):
+            if not np.isfinite(n) or n < 8:
+                continue
+            half = min(0.35 * n, 20.0)
+            s = np.arange(-half, half + 0.125, 0.25)
+            normal = np.array([-d[1], d[0]]) / n
+            profile = _sample(picture, m + s[:, None] * normal)
+            slope = np.abs(np.diff(profile)).max() / 0.25
+            contrast = np.ptp(profile)
+            if contrast > 16:
+                sigmas.append(float(contrast / (np.sqrt(2 * np.pi) * slope)))
+    return float(np.median(sigmas)) if sigmas else float("nan")
+
+
 # ---- ChArUco
 
 
-def _detect_charuco(picture: NDArray[np.uint8], target: Charuco) -> NDArray[np.float64]:
+def _detect_charuco(
+    picture: NDArray[np.uint8], target: Charuco
+) -> tuple[NDArray[np.float64], float]:
+    """Corners, and the blur that renders the board most like the picture."""
     grid = np.full((target.rows, target.columns, 2), np.nan)
     corners, ids = _read_markers(picture, target)
-    if ids is None or len(ids) < 4:
-        return grid
+    if ids is None or len(ids) < grid.size // 4:
+        # Blurred markers are read again with their edges raised; that is for reading alone.
+        soft = cv2.GaussianBlur(picture, (0, 0), 2.5)
+        again = _read_markers(
+            np.asarray(cv2.addWeighted(picture, 3, soft, -2, 0), np.uint8), target
+        )
+        if again[1] is not None and (ids is None or len(again[1]) > len(ids)):
+            corners, ids = again
+    if ids is None or len(ids) < 6:
+        return grid, np.nan
     grid.reshape(-1, 2)[ids.ravel()] = corners.reshape(-1, 2)
-    grid = _keep_true(picture, _refine(picture, grid, CHARUCO_WINDOW), target)
+    board = Board(target.cells(), target.cells_per_square)
+    sigma = _fit_blur(picture, board, grid)
     while True:
-        guess = _predict_missing(grid)
-        new = np.isfinite(guess[..., 0])
-        if not new.any():
-            return grid
-        merged = _refine(picture, np.where(new[..., None], guess, grid), CHARUCO_WINDOW)
-        merged = _keep_true(picture, np.where(new[..., None], merged, grid), target)
-        if np.isfinite(merged[..., 0]).sum() <= np.isfinite(grid[..., 0]).sum():
-            return grid
-        grid = merged
+        found = np.isfinite(grid[..., 0]).sum()
+        grid = _fit_patches(picture, board, grid, sigma)
+        if np.isfinite(grid[..., 0]).sum() <= found:
+            break
+    # Once more, from neighbours that are all well placed now.
+    sigma = _fit_blur(picture, board, grid)
+    return _fit_patches(picture, board, grid, sigma), sigma
+
+
+def _fit_blur(picture: NDArray[np.uint8], board: Board, grid: NDArray[np.float64]) -> float:
+    """The blur whose patches correlate best, over a few corners of `grid`."""
+    found = np.argwhere(np.isfinite(grid[..., 0])).tolist()
+    places: list[tuple[int, int, NDArray[np.float64]]] = []
+    for row, column in found[:: max(1, len(found) // 8)]:
+        if (h := _neighbourhood(grid, row, column)) is not None:
+            places.append((row, column, h))
+    scores = [
+        sum(fit_corner(picture, board, (r, c), h, sigma)[1] for r, c, h in places)
+        for sigma in BLURS
+    ]
+    return BLURS[int(np.argmax(scores))]
+
+
+def _fit_patches(
+    picture: NDArray[np.uint8], board: Board, grid: NDArray[np.float64], sigma: float
+) -> NDArray[np.float64]:
+    """Every corner with found neighbours fitted where they predict it; NaN where not seen."""
+    fitted = np.full_like(grid, np.nan)
+    for row, column in np.ndindex(grid.shape[:2]):
+        h = _neighbourhood(grid, row, column)
+        if h is None:
+            continue
+        place, correlation = fit_corner(picture, board, (row, column), h, sigma)
+        if correlation > LEAST_CORRELATION:
+            fitted[row, column] = place
+    return fitted
 
 
 def _read_markers(picture: NDArray[np.uint8], target: Charuco) -> tuple[Any, Any]:
@@ -232,13 +277,8 @@ def _read_markers(picture: NDArray[np.uint8], target: Charuco) -> tuple[Any, Any
     return corners, ids
 
 
-def _margin(target: Charuco) -> float:
-    """White rim between a square's edge and its marker, in squares."""
-    return (target.square - target.marker) / 2 / target.square
-
-
 def _neighbourhood(
-    grid: NDArray[np.float64], row: int, column: int, least: int
+    grid: NDArray[np.float64], row: int, column: int
 ) -> NDArray[np.float64] | None:
     """Homography from (column, row, 1) to pixels by the nearest found corners but this one."""
     found = np.argwhere(np.isfinite(grid[..., 0]))
@@ -246,62 +286,11 @@ def _neighbourhood(
     found = found[(distance > 0) & (distance <= 3)]
     distance = np.hypot(*(found - [row, column]).T)
     near = found[np.argsort(distance, kind="stable")[:12]]
-    if len(near) < least or np.linalg.matrix_rank(near - near.mean(axis=0)) < 2:
+    if len(near) < 5 or np.linalg.matrix_rank(near - near.mean(axis=0)) < 2:
         return None
-    h, _ = cv2.findHomography(near[:, ::-1].astype(float), grid[near[:, 0], near[:, 1]])
-    return None if h is None else np.asarray(h, float)
-
-
-def _through(h: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
-    mapped = np.column_stack([points, np.ones(len(points))]) @ h.T
-    return mapped[:, :2] / mapped[:, 2:]
-
-
-def _predict_missing(grid: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Where missing corners with found neighbours should be; NaN elsewhere."""
-    guess = np.full_like(grid, np.nan)
-    for row, column in np.argwhere(np.isnan(grid[..., 0])):
-        h = _neighbourhood(grid, row, column, least=6)
-        if h is not None:
-            guess[row, column] = _through(h, np.array([[column, row]], float))[0]
-    return guess
-
-
-def _keep_true(
-    picture: NDArray[np.uint8], grid: NDArray[np.float64], target: Charuco
-) -> NDArray[np.float64]:
-    """Without corners that leave their neighbours' grid or do not look like themselves.
-
-    Right in the white rim of its squares a corner must show dark, bright, dark, bright in the
-    order that its place on the board demands.
-    """
-    kept = grid.copy()
-    reach = _margin(target) * 0.7
-    height, width = picture.shape
-    low, high = np.percentile(picture, [2, 98])
-    for row, column in np.argwhere(np.isfinite(grid[..., 0])):
-        h = _neighbourhood(grid, row, column, least=4)
-        if h is None:
-            continue
-        place = np.array([column, row], float)
-        here = _through(h, place[None])[0]
-        ring = _through(h, place + reach * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]))
-        pitch = np.linalg.norm(ring[0] - ring[2]) / (2 * np.sqrt(2) * reach)
-        ring += grid[row, column] - here
-        inside = (ring >= 0).all() and (ring <= [width - 1, height - 1]).all()
-        shades = _sample(picture, ring) if inside else np.zeros(4)
-        dark, bright = (
-            (shades[0::2], shades[1::2])
-            if (row + column) % 2 == 0
-            else (
-                shades[1::2],
-                shades[0::2],
-            )
-        )
-        shows = inside and bright.min() - dark.max() > 0.1 * (high - low)
-        if not shows or np.linalg.norm(here - grid[row, column]) > 0.2 * pitch:
-            kept[row, column] = np.nan
-    return kept
+    found_pixels = grid[near[:, 0], near[:, 1]]
+    h: Any = cv2.findHomography(near[:, ::-1].astype(float), found_pixels)[0]
+    return None if h is None or abs(np.linalg.det(h)) < 1e-12 else np.asarray(h, float)
 
 
 # ---- common
@@ -313,10 +302,12 @@ def _refine(
     """Foerstner's corner, `window` local pitches (2 to 15 pixels) to each side."""
     refined = grid.copy()
     height, width = picture.shape
-    found = np.isfinite(grid[..., 0]) & (grid > 0).all(axis=-1)
-    found &= (grid < [width - 1, height - 1]).all(axis=-1)
+    # The window stays inside the picture: repeated border pixels would pull the corner.
+    room = np.minimum(grid, [width - 1, height - 1] - grid).min(axis=-1) - 1
+    found = np.isfinite(grid[..., 0]) & (room >= 2)
     refined[~found] = np.nan
-    half = np.clip(np.round(window * _pitch(grid)), 2, 15).astype(int)
+    half = np.clip(np.round(window * _pitch(grid)), 2, 15)
+    half = np.where(found, np.minimum(half, np.floor(room)), 0).astype(int)
     stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 60, 1e-3)
     for w in np.unique(half[found]):
         chosen = found & (half == w)

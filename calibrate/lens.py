@@ -210,7 +210,7 @@ def calibrate_lens(
         )
     unknowns = solver.lensmodel_num_params(_lensmodel(model, problem)) + 6 * len(corners) + 2
     measured = 2 * int(np.isfinite(corners[..., 0]).sum())
-    if measured < 1.5 * unknowns:
+    if measured < 2 * unknowns:
         raise UserError(
             f"{measured // 2} corners are too few for {model} with {unknowns} unknowns: "
             "take more pictures or choose a simpler model"

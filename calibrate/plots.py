@@ -8,6 +8,7 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import BoundaryNorm
 from matplotlib.figure import Figure
 
 from chromeball.calibrate.lens import Lens
@@ -54,7 +55,7 @@ def plot_uncertainty(lens: Lens, path: str | os.PathLike[str]) -> None:
     """Uncertainty of projection at infinity over the picture, with the corners' hull."""
     figure, axes = _picture(lens)
     pixels, values = lens.uncertainty(columns=48)
-    norm = mpl.colors.BoundaryNorm(LEVELS, 256)
+    norm = BoundaryNorm(LEVELS, 256)
     filled = axes.contourf(
         pixels[..., 0], pixels[..., 1], np.minimum(values, LEVELS[-1]),
         levels=LEVELS, norm=norm, cmap="YlGnBu_r",

@@ -168,6 +168,8 @@ def _refine(
         step = np.linalg.lstsq(
             normal + damping * np.diag(np.diag(normal)), -jacobian.T @ error, rcond=None
         )[0]
+        if np.abs(step).max() < 1e-13 * (1 + np.abs(pose.translation).max()):
+            break
         turned = Pose.from_rotation_vector(step[:3], np.zeros(3)).rotation @ pose.rotation
         u, _, vt = np.linalg.svd(turned)
         candidate = Pose(u @ vt, pose.translation + step[3:])

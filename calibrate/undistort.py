@@ -64,7 +64,7 @@ def undistort(
             )
             for f in (cv2.erode, cv2.dilate)
         )  # fmt: skip
-        planes.append(np.clip(np.asarray(value), np.asarray(low), np.asarray(high)))
+        planes.append(np.asarray(np.clip(value, low, high), np.float32))
     result = np.where(seen[..., None], np.stack(planes, axis=-1), 0)
     if np.issubdtype(pixels.dtype, np.integer):
         result = np.round(result)

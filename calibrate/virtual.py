@@ -27,7 +27,7 @@ def photograph(
 
     `blur` is the standard deviation of the lens's spread in pixels, `noise` that of the codes.
     """
-    fine = 4
+    fine = 3
     n = target.cells_per_square
     board = np.pad(target.cells(), max(n // 2, 1), constant_values=255)
     rim = max(n // 2, 1)

@@ -24,7 +24,7 @@ PLACES = [(0.2, 0.8, 1.0), (-0.9, 0.5, 0.4), (0.05, 1.6, 0.1), (0.7, 0.25, -0.9)
 def see(
     lens: CameraModel, place: tuple[float, float, float], target: tuple[float, float, float]
 ) -> CameraModel:
-    return lens.posed(Pose.look_at(place, target))
+    return lens.posed(Pose.look_at(np.array(place), np.array(target)))
 
 
 @pytest.mark.parametrize("place", PLACES)
@@ -48,10 +48,12 @@ def test_many_points_in_space() -> None:
 
 def test_fisheye_looking_away() -> None:
     """The rectangle near the rim, part of it beyond 90 degrees from the axis."""
-    camera = see(FISHEYE, (0.1, 0.3, 0.5), (0.1, 0.35, 3.0))
+    camera = see(FISHEYE, (0.1, 0.3, 0.25), (0.1, 0.9, -3.0))
+    inside = camera.world_from_camera.inverse().apply(RECTANGLE)
+    assert inside[:, 2].min() < 0
     pixels = camera.project_world(RECTANGLE)
     found = solve_pose(FISHEYE, RECTANGLE, pixels)
-    np.testing.assert_allclose(found.world_from_camera.translation, [0.1, 0.3, 0.5], atol=1e-7)
+    np.testing.assert_allclose(found.world_from_camera.translation, [0.1, 0.3, 0.25], atol=1e-7)
 
 
 @pytest.mark.parametrize("lens", [LENS, FISHEYE], ids=["distorted", "fisheye"])
@@ -62,15 +64,15 @@ def test_covariance_is_honest(lens: CameraModel) -> None:
     pixels = camera.project_world(RECTANGLE)
     rng = np.random.default_rng(4)
     distances: list[float] = []
-    for _ in range(200):
+    for _ in range(100):
         clicks = pixels + rng.normal(0, 0.3, pixels.shape)
         found = solve_pose(lens, RECTANGLE, clicks, sigma=0.3)
         turn = Pose(truth.rotation.T @ found.world_from_camera.rotation, np.zeros(3))
         shift = found.world_from_camera.translation - truth.translation
         error = np.concatenate([turn.rotation_vector(), shift])
         distances.append(float(error @ np.linalg.solve(found.covariance, error)))
-    # The mean of 200 such values has standard deviation sqrt(12 / 200) = 0.24.
-    assert np.mean(distances) == pytest.approx(6, abs=1.0)
+    # The mean of 100 such values has standard deviation sqrt(12 / 100) = 0.35.
+    assert np.mean(distances) == pytest.approx(6, abs=1.1)
 
 
 def test_residuals_tell_the_clicks_noise() -> None:
@@ -80,9 +82,9 @@ def test_residuals_tell_the_clicks_noise() -> None:
     rng = np.random.default_rng(5)
     sums = [
         4 * solve_pose(LENS, RECTANGLE, pixels + rng.normal(0, 0.5, (4, 2))).rms ** 2
-        for _ in range(200)
+        for _ in range(100)
     ]
-    assert np.mean(sums) == pytest.approx(2 * 0.5**2, rel=0.25)
+    assert np.mean(sums) == pytest.approx(2 * 0.5**2, rel=0.35)
 
 
 def test_far_rectangle_is_called_ambiguous() -> None:
@@ -99,7 +101,7 @@ def clicks() -> NDArray[np.float64]:
 
 
 def test_wrong_order_is_refused() -> None:
-    with pytest.raises(UserError, match="check their order|below the floor"):
+    with pytest.raises(UserError, match=r"check their order|below the floor"):
         solve_pose(LENS, RECTANGLE, clicks()[[0, 2, 1, 3]])
     with pytest.raises(UserError, match="below the floor"):
         solve_pose(LENS, RECTANGLE, clicks()[::-1])
@@ -119,7 +121,7 @@ def test_degenerate_points_are_refused() -> None:
     with pytest.raises(UserError, match="points 1 and 2 were clicked at the same pixel"):
         solve_pose(LENS, RECTANGLE, [q[0], q[0], q[2], q[3]])
     with pytest.raises(UserError, match="outside the picture of 640x480"):
-        solve_pose(LENS, RECTANGLE, q + [600, 0])
+        solve_pose(LENS, RECTANGLE, q + np.array([600, 0]))
     with pytest.raises(UserError, match="must be finite"):
         solve_pose(LENS, RECTANGLE, q * np.nan)
     with pytest.raises(UserError, match="does not see pixel 5,5"):
