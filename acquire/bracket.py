@@ -134,11 +134,11 @@ def capture_bracket(
                 name = f"frame_{index:02d}.png"
                 rows.append(run.capture(time, requested[time], name, _primer(order, camera)))
                 journal.append(rows[-1])
-        except DeviceError as error:
-            raise _with_hint(error, len(rows), len(order)) from error
-        except BaseException:
+        except BaseException as error:
             if not rows:
                 journal.remove()
+            if isinstance(error, DeviceError):
+                raise _with_hint(error, len(rows), len(order)) from error
             raise
         rows.sort(key=lambda row: row.time)
         with stage.output(file) as temporary:

@@ -86,11 +86,11 @@ def visca(
     faults = Faults(silent_after=silent_after, drop=drop, garble=garble)
     port = ViscaPort(camera, link, baud=baud, speed=speed, faults=faults, seed=int(seeds[1]))
     with port, VideoServer(camera, path, speed=speed):
-        print(f"{MODELS[model].name} on {link}, video on {video}", file=sys.stderr, flush=True)
-        return _run(command) if command else _stand()
+        ready = f"{MODELS[model].name} on {link}, video on {video}"
+        return _run(command, ready) if command else _stand(ready)
 
 
-def _run(command: tuple[str, ...]) -> int:
+def _run(command: tuple[str, ...], ready: str) -> int:
     """Run `command`; an interrupt goes to it as well, and its exit code comes back."""
     import shutil
     import subprocess
@@ -102,6 +102,7 @@ def _run(command: tuple[str, ...]) -> int:
         program = sys.argv[0]  # our own, though its folder is not on the PATH
     if program is None:
         raise UserError("no such command", file=command[0])
+    print(ready, file=sys.stderr, flush=True)
     child = subprocess.Popen([program, *command[1:]])
     # A terminal's Ctrl-C reaches the child by itself; a kill of ours is passed on.
     for number in (signal.SIGTERM, signal.SIGHUP):
@@ -114,10 +115,11 @@ def _run(command: tuple[str, ...]) -> int:
         return 128 - code if code < 0 else code
 
 
-def _stand() -> int:
+def _stand(ready: str) -> int:
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.default_int_handler)
     try:
+        print(ready, file=sys.stderr, flush=True)
         signal.pause()
     except KeyboardInterrupt:
         return 0

@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -110,7 +109,6 @@ def test_the_emulator_stands_until_it_is_told_to_go(set_up: Path):
     assert process.stderr is not None
     assert process.stderr.readline() == "EVI-D100P on dev, video on socket:v\n"
     assert (set_up / "dev").is_symlink()
-    time.sleep(0.2)
     process.send_signal(signal.SIGTERM)
     assert process.wait(10) == 0
     assert process.stderr.read() == ""
