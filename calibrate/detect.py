@@ -217,29 +217,35 @@ def _detect_charuco(
         return grid, np.nan
     grid.reshape(-1, 2)[ids.ravel()] = corners.reshape(-1, 2)
     board = Board(target.cells(), target.cells_per_square)
-    sigma = _fit_blur(picture, board, grid)
+    sigma = _fit_blur(picture, board, grid, BLURS)
     while True:
         found = np.isfinite(grid[..., 0]).sum()
         grid = _fit_patches(picture, board, grid, sigma)
         if np.isfinite(grid[..., 0]).sum() <= found:
             break
     # Once more, from neighbours that are all well placed now.
-    sigma = _fit_blur(picture, board, grid)
+    k = BLURS.index(sigma)
+    sigma = _fit_blur(picture, board, grid, BLURS[max(0, k - 1) : k + 2])
     return _fit_patches(picture, board, grid, sigma), sigma
 
 
-def _fit_blur(picture: NDArray[np.uint8], board: Board, grid: NDArray[np.float64]) -> float:
-    """The blur whose patches correlate best, over a few corners of `grid`."""
+def _fit_blur(
+    picture: NDArray[np.uint8],
+    board: Board,
+    grid: NDArray[np.float64],
+    blurs: tuple[float, ...],
+) -> float:
+    """The one of `blurs` whose patches correlate best, over a few corners of `grid`."""
     found = np.argwhere(np.isfinite(grid[..., 0])).tolist()
     places: list[tuple[int, int, NDArray[np.float64]]] = []
-    for row, column in found[:: max(1, len(found) // 8)]:
+    for row, column in found[:: max(1, len(found) // 6)]:
         if (h := _neighbourhood(grid, row, column)) is not None:
             places.append((row, column, h))
     scores = [
         sum(fit_corner(picture, board, (r, c), h, sigma)[1] for r, c, h in places)
-        for sigma in BLURS
+        for sigma in blurs
     ]
-    return BLURS[int(np.argmax(scores))]
+    return blurs[int(np.argmax(scores))]
 
 
 def _fit_patches(
