@@ -89,13 +89,18 @@ def render_patch(
     """The board about pixel `centre`, (2 half + 1, 2 half + 1), blurred by `sigma` pixels."""
     pad = int(np.ceil(3 * sigma)) + 1
     count = 2 * (half + pad) + 1
-    u = (np.arange(count * FINE) + 0.5) / FINE - 0.5 - (half + pad)
-    x, y = np.meshgrid(u, u)
-    place = apply(np.linalg.inv(h), np.stack([x.ravel(), y.ravel()], axis=-1) + centre)
-    rows, columns = board.cells.shape
+    x, y = centre - (half + pad) - 0.5 + 0.5 / FINE
+    pixel_from_fine = np.array([[1 / FINE, 0, x], [0, 1 / FINE, y], [0, 0, 1]])
+    n = board.n
+    cell_from_place = np.array([[n, 0, n - 0.5], [0, n, n - 0.5], [0, 0, 1.0]])
     # Beyond the board its outermost cells go on; they are hardly in reach.
-    cell = np.clip(np.floor((place + 1) * board.n), 0, [columns - 1, rows - 1]).astype(int)
-    shade = board.cells[cell[:, 1], cell[:, 0]].astype(np.float32).reshape(x.shape)
+    shade = cv2.warpPerspective(
+        board.cells,
+        cell_from_place @ np.linalg.inv(h) @ pixel_from_fine,
+        (count * FINE, count * FINE),
+        flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_REPLICATE,
+    ).astype(np.float32)
     # Sensor pixels are FINE wide, and are a box blur of their own.
     fine = cv2.GaussianBlur(shade, (0, 0), max(sigma, 0.1) * FINE)
     coarse = cv2.resize(fine, (count, count), interpolation=cv2.INTER_AREA)
