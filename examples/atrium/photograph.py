@@ -125,7 +125,7 @@ def photograph(folder: Path, samples: int, probe_size: int) -> None:
     photograph_bracket(plate, plate_times, folder / "photographs/plate", rng)
     say("photographs/plate_*.png")
 
-    target = parse_target(scene.calibrate.target if scene.calibrate else None)
+    target = parse_target(scene.calibrate.target or "" if scene.calibrate else "")
     assert isinstance(target, Charuco)
     for i, pose in enumerate(board_poses(view, BOARD_VIEWS)):
         picture = radiance(empty.with_mesh(board(target, pose)), view, max(4, samples // 32))
