@@ -1,0 +1,211 @@
+"""A bracket: which pictures, how much light each was given, and the pictures themselves.
+
+A frame's exposure is ``time * ISO / 100 / N^2`` where aperture and ISO are known for all
+frames, its time in seconds otherwise, so that all brackets of one camera share one scale.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chromeball.scene.errors import UserError
+from chromeball.scene.image import Exposure, read_exposure, read_image
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One picture of a bracket: its file, and time (s), aperture (f-number), ISO speed."""
+
+    path: Path
+    time: float
+    aperture: float | None = None
+    iso: float | None = None
+    camera: str | None = None
+
+
+@dataclass(frozen=True)
+class Bracket:
+    """The frames, each with its exposure; ``scale`` says how the exposures were made."""
+
+    frames: tuple[Frame, ...]
+    exposures: NDArray[np.float64]  # (P,)
+    scale: str
+    inputs: tuple[Path, ...]  # what a record lists: pictures, and take.json where one was read
+
+    @property
+    def paths(self) -> list[Path]:
+        """The pictures in order."""
+        return [frame.path for frame in self.frames]
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A frame's pixels, (H, W, C) with C of 1 or 3; `linear` if proportional to exposure."""
+
+    path: Path
+    pixels: NDArray[Any]
+    channels: tuple[str, ...]
+    linear: bool
+
+
+def read_bracket(
+    inputs: Sequence[str | os.PathLike[str]], times: Sequence[float] | None = None
+) -> Bracket:
+    """Gather frames from pictures, take folders and ``take.json`` files.
+
+    `times` (seconds, one a picture) override those of takes and metadata.
+
+    Raises
+    ------
+    UserError
+        A missing picture, no exposure time in the metadata, times that do not match.
+
+    """
+    if not inputs:
+        raise UserError("no pictures given")
+    frames: list[Frame] = []
+    files: list[Path] = []
+    for item in map(Path, inputs):
+        if item.is_dir() or item.suffix == ".json":
+            from chromeball.acquire.take import read_take, take_path
+
+            files.append(take_path(item))
+            for shot in read_take(item).frames:
+                seen = read_exposure(shot.path)
+                frames.append(
+                    Frame(
+                        shot.path,
+                        shot.time,
+                        shot.row.aperture or seen.aperture,
+                        shot.row.iso or seen.iso,
+                        seen.camera,
+                    )
+                )
+        else:
+            frames.append(_photograph(item, read_exposure(item), timed=times is not None))
+    if times is not None:
+        if len(times) != len(frames):
+            raise UserError(
+                f"{len(times)} exposure times for {len(frames)} pictures: give one a picture"
+            )
+        for time in times:
+            if not (math.isfinite(time) and time > 0):
+                raise UserError(f"exposure time {time} is not a positive number of seconds")
+        frames = [replace(f, time=float(t)) for f, t in zip(frames, times, strict=True)]
+    exposures, scale = _exposures(frames)
+    return Bracket(
+        tuple(frames), exposures, scale, (*files, *(frame.path for frame in frames))
+    )
+
+
+def _photograph(path: Path, seen: Exposure, *, timed: bool) -> Frame:
+    if seen.time is None and not timed:
+        raise UserError(
+            "no exposure time in its metadata; give the times of all pictures with --times",
+            file=path,
+        )
+    return Frame(path, seen.time or 1.0, seen.aperture, seen.iso, seen.camera)
+
+
+def _exposures(frames: Sequence[Frame]) -> tuple[NDArray[np.float64], str]:
+    time = np.array([frame.time for frame in frames], np.float64)
+    known = [frame.aperture is not None and frame.iso is not None for frame in frames]
+    if all(known):
+        gain = np.array([(f.iso or 0) / 100 / (f.aperture or 1) ** 2 for f in frames])
+        return time * gain, "time * ISO/100 / N^2"
+    for name in ("aperture", "iso"):
+        values = {getattr(frame, name) for frame in frames} - {None}
+        if len(values) > 1:
+            silent = next(f for f, k in zip(frames, known, strict=True) if not k)
+            raise UserError(
+                f"the bracket changes its {name}, and this picture lacks aperture or ISO: "
+                "leave it out, or use pictures with full metadata",
+                file=silent.path,
+            )
+    return time, "time"
+
+
+def pictures(bracket: Bracket, tell: Callable[[str], None]) -> Iterator[Picture]:
+    """Read the frames in order, a few ahead, and see that they fit together.
+
+    Raises
+    ------
+    UserError
+        A picture that cannot be read, another size, depth or channels than the first, NaN
+        or negative values in a linear picture.
+
+    """
+    first: Picture | None = None
+    ahead = min(2, os.cpu_count() or 1)
+    with ThreadPoolExecutor(ahead) as pool:
+        waiting = [pool.submit(_read, path) for path in bracket.paths[:ahead]]
+        for number, path in enumerate(bracket.paths):
+            picture = waiting.pop(0).result()
+            if number + ahead < len(bracket.paths):
+                waiting.append(pool.submit(_read, bracket.paths[number + ahead]))
+            first = first or picture
+            _fits(first, picture)
+            tell(f"{number + 1}/{len(bracket.paths)} {path.name}")
+            yield picture
+
+
+def _read(path: Path) -> Picture:
+    image = read_image(path)
+    names = [name.upper() for name in image.channels]
+    pixels = image.pixels
+    match names:
+        case ["R", "G", "B", *_] | ["Y", *_]:
+            count = 3 if names[0] == "R" else 1
+            chosen = names[:count]
+            pixels = pixels[..., :count]
+        case _ if {"R", "G", "B"} <= set(names):
+            chosen = ["R", "G", "B"]
+            pixels = pixels[..., [names.index(name) for name in chosen]]
+        case _:
+            raise UserError(
+                f"channels {', '.join(image.channels)}: neither RGB nor grey", file=path
+            )
+    pixels = np.ascontiguousarray(pixels)
+    if pixels.dtype == np.float32:
+        bad = ~np.isfinite(pixels) | (pixels < 0)
+        if bad.any():
+            y, x, _ = np.argwhere(bad)[0]
+            raise UserError(
+                f"{int(bad.any(axis=2).sum())} pixels are NaN, infinite or negative, the first "
+                f"at x {x}, y {y}",
+                file=path,
+            )
+    return Picture(path, pixels, tuple(chosen), image.linear)
+
+
+def _fits(first: Picture, picture: Picture) -> None:
+    def size(p: Picture) -> str:
+        return f"{p.pixels.shape[1]} x {p.pixels.shape[0]}"
+
+    if size(picture) != size(first):
+        raise UserError(
+            f"{size(picture)} pixels, but {first.path.name} has {size(first)}: "
+            "a bracket's pictures have one size",
+            file=picture.path,
+        )
+    if picture.channels != first.channels:
+        raise UserError(
+            f"channels {', '.join(picture.channels)}, but {first.path.name} has "
+            f"{', '.join(first.channels)}",
+            file=picture.path,
+        )
+    if picture.pixels.dtype != first.pixels.dtype or picture.linear != first.linear:
+        raise UserError(
+            f"{picture.pixels.dtype} values, but {first.path.name} has {first.pixels.dtype}: "
+            "do not mix RAW, EXR and 8-bit pictures in one bracket",
+            file=picture.path,
+        )
