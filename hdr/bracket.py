@@ -102,9 +102,7 @@ def read_bracket(
                 raise UserError(f"exposure time {time} is not a positive number of seconds")
         frames = [replace(f, time=float(t)) for f, t in zip(frames, times, strict=True)]
     exposures, scale = _exposures(frames)
-    return Bracket(
-        tuple(frames), exposures, scale, (*files, *(frame.path for frame in frames))
-    )
+    return Bracket(tuple(frames), exposures, scale, (*files, *(frame.path for frame in frames)))
 
 
 def _photograph(path: Path, seen: Exposure, *, timed: bool) -> Frame:

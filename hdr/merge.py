@@ -33,7 +33,7 @@ type Float = NDArray[np.float64]
 SENSOR_NOISE = (3.5e-6, 3.9e-9)
 #: linear values from this share of white on are saturated
 SATURATED = 0.99
-#: codes over which the weight falls to zero at the dark and at the bright end
+#: codes over which the weight falls to zero at the dark end and below saturation
 TAPER = (4, 16)
 
 
@@ -41,13 +41,13 @@ TAPER = (4, 16)
 class Radiance:
     """What a merge makes.
 
-    ``pixels`` (H, W, C) float32; ``sigma`` its standard error, infinite where it is a bound;
+    ``radiance`` (H, W, C) float32; ``sigma`` its standard error, infinite where it is a bound;
     ``clipped`` (H, W) int8: 1 where a channel is saturated in all frames (the pixel is a lower
     bound), -1 where one is black in all (an upper bound), else 0; ``high`` and ``low`` (C,)
     count such values per channel.
     """
 
-    pixels: NDArray[np.float32]
+    radiance: NDArray[np.float32]
     sigma: NDArray[np.float32] | None
     clipped: NDArray[np.int8]
     high: NDArray[np.int64]
@@ -56,16 +56,20 @@ class Radiance:
 
 def weights(response: Response) -> Float:
     """w(z) = taper(z) / variance of ln X(z); (C, 256), zero at the ends."""
-    z = np.arange(CODES)
-    dark, bright = TAPER
-    taper = np.clip(np.minimum(z / dark, (CODES - 1 - z) / bright), 0, 1)
     slope = np.gradient(response.log_exposure, axis=1)
     # no pixel is read better than its quantisation
     noise = np.maximum(response.code_noise, 12**-0.5)[:, None]
-    return taper / ((slope * noise) ** 2 + response.sigma**2)
+    # a saturated pixel shows lower codes too, by the noise that came after it (JPEG)
+    brightest = CODES - 1 - np.floor(3 * noise)
+    z = np.arange(CODES)
+    dark, bright = TAPER
+    taper = np.clip(np.minimum(z / dark, (brightest - z) / bright), 0, 1)
+    variance = (slope * noise) ** 2 + response.sigma**2
+    # a code that leaves its exposure open by a factor of e or more measures nothing
+    return np.where(variance < 1, taper / variance, 0)
 
 
-def merge_codes(
+def merge_frames(
     frames: Sequence[NDArray[np.uint8]],
     exposures: Float,
     response: Response,
@@ -106,7 +110,7 @@ def merge_linear(
     """
     shape = _shape(frames, exposures)
     kind = frames[0].dtype
-    if kind not in (np.uint16, np.float32):
+    if kind != np.uint16 and kind != np.float32:
         raise UserError(f"linear pictures of {kind} values: 16-bit or float ones are needed")
     if white is None:
         white = 65535.0 if kind == np.uint16 else max(float(f.max()) for f in frames)
@@ -130,9 +134,9 @@ def merge_linear(
     return _radiance(merged, shape)
 
 
-def stops(radiance: Radiance) -> float:
+def stops(merged: Radiance) -> float:
     """Dynamic range: log2 of the brightest over the darkest measured value (99.99 / 0.01 %)."""
-    measured = radiance.pixels[radiance.clipped == 0]
+    measured = merged.radiance[merged.clipped == 0]
     measured = measured[measured > 0]
     if measured.size == 0:
         return 0.0
@@ -140,13 +144,13 @@ def stops(radiance: Radiance) -> float:
     return float(np.log2(high / low))
 
 
-def preview(radiance: Radiance, width: int = 640) -> NDArray[np.uint8]:
+def preview(merged: Radiance, width: int = 640) -> NDArray[np.uint8]:
     """A small tone-mapped picture (Reinhard et al. 2002, global) to look at, (h, w, 3)."""
     import cv2
 
     from chromeball.scene.image import to_display
 
-    pixels = radiance.pixels
+    pixels = merged.radiance
     scale = min(1.0, width / pixels.shape[1])
     size = (
         max(1, round(pixels.shape[1] * scale)),
@@ -192,7 +196,7 @@ def _radiance(
 ) -> Radiance:
     pixels, sigma, clipped, counts = merged
     return Radiance(
-        pixels=pixels.reshape(shape),
+        radiance=pixels.reshape(shape),
         sigma=None if sigma is None else sigma.reshape(shape),
         clipped=clipped.reshape(shape[:2]),
         high=counts[:, 0],

@@ -121,9 +121,11 @@ def solve(
     `exposures` (P,) are relative and positive. With `refine_times` the log exposures are
     unknowns too, shared by the channels; see :func:`refine`.
 
-    The covariance of g is ``M^-1 (s^2 B + lambda^2 sigma_s^2 R) M^-1``, M = s H + lambda R:
-    B is the scatter of the patches' scores (a sandwich, so unequal noise is allowed for), the
-    second term what smoothing bends, with sigma_s^2 the mean square of w g'' found.
+    The variance of g is the diagonal of ``s^2 M^-1 B M^-1``, M = s H + lambda D'D, B the
+    scatter of the patches' scores (a sandwich, so unequal noise is allowed for), plus what
+    smoothing bends, ``lambda M^-1 D' c`` for c = w g'': once for c of random sign and the mean
+    square found, once for the largest c found, everywhere of one sign. The bias that noise
+    itself leaves (it shrinks with the patch) is not in it.
 
     Raises
     ------
@@ -140,14 +142,18 @@ def solve(
     _refuse_few(samples, used, observed)
     s = np.sum(w**2) / np.trace(H[:, :CODES, :CODES], axis1=1, axis2=2)
 
+    D = second_difference(w)
+
     def fit(tau: Float) -> tuple[Float, Float, Float, Float]:
         g, inverse, condition = _solve(H, s, tau, smoothness)
         B, within, freedom = kernel.residuals(codes, w**2, share, g, tau)
-        bend = np.mean((w[1:-1] * np.diff(g, 2)) ** 2, axis=1)
-        R = roughness(w)
-        middle = s[:, None, None] ** 2 * B + (smoothness**2 * bend)[:, None, None] * R
-        covariance = inverse @ middle @ inverse
-        sigma = np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0))
+        half = s[:, None, None] * inverse
+        noise = np.einsum("cij,cjk,cik->ci", half, B, half, optimize=True)
+        curvature = np.abs(w[1:-1] * np.diff(g, 2)) * (observed[:, 1:-1] > 0)
+        bend = smoothness * (inverse @ D.T)
+        ripple = np.mean(curvature**2, axis=1)[:, None] * np.sum(bend**2, axis=2)
+        sag = curvature.max(axis=1)[:, None] * bend.sum(axis=2)
+        sigma = np.sqrt(np.maximum(noise, 0) + ripple + sag**2)
         return g, sigma, np.sqrt(within.sum(1) / freedom.sum(1)), condition
 
     g, sigma, rms, condition = fit(log_exposures)
@@ -163,6 +169,7 @@ def solve(
         )
     risen = np.stack([strictly_rising(c, e) for c, e in zip(g, sigma, strict=True)])
     moved = np.abs(risen - g) > 1e-9
+    risen -= risen[:, MIDDLE, None]
     return Solution(
         g=risen,
         sigma=np.maximum(sigma, np.abs(risen - g)),
@@ -180,9 +187,14 @@ def solve(
     )
 
 
+def second_difference(w: Float) -> Float:
+    """D with D g = w(z) g''(z) for z = 1 .. n-2; shape (n - 2, n)."""
+    return np.diff(np.eye(len(w)), 2, axis=0) * w[1:-1, None]
+
+
 def roughness(w: Float) -> Float:
     """R with g' R g = sum over z = 1 .. n-2 of (w(z) g''(z))^2; shape (n, n)."""
-    D = np.diff(np.eye(len(w)), 2, axis=0) * w[1:-1, None]
+    D = second_difference(w)
     return D.T @ D
 
 
@@ -194,22 +206,23 @@ def refine(H: Float, s: Float, log_exposures: Float, smoothness: float) -> Float
     log exposures, each frame weighted by what it observes, has slope 1 and offset 0.
     """
     P = len(log_exposures)
-    T = np.zeros((P, P))
+    joint = np.zeros((P, P))
     observes = np.zeros(P)
     keep = np.arange(CODES) != MIDDLE
     penalty = smoothness * roughness(hat())[np.ix_(keep, keep)]
     for h, scale in zip(H, s, strict=True):
         gg, gt, tt = h[:CODES, :CODES], h[:CODES, CODES:][keep], h[CODES:, CODES:]
         M = scale * gg[np.ix_(keep, keep)] + penalty
-        T += scale * tt - scale**2 * gt.T @ np.linalg.solve(M, gt)
+        joint += scale * tt - scale**2 * gt.T @ np.linalg.solve(M, gt)
         observes += scale * np.diag(tt)
-    T += 1e-6 * np.trace(T) / P * np.eye(P)  # frames that observe nothing stay where they are
+    # frames that observe nothing stay where they are
+    stay = 1e-6 * np.trace(joint) / P * np.eye(P)
     observes /= observes.sum()
     centred = log_exposures - observes @ log_exposures
-    # tau = given + d, d' A = 0: (T A; A' 0) (d; multipliers) = (-T given; 0)
+    # tau = given + d, d' A = 0: (T + stay, A; A' 0) (d; multipliers) = (-T given; 0)
     A = observes[:, None] * np.stack([np.ones(P), centred], axis=1)
-    system = np.block([[T, A], [A.T, np.zeros((2, 2))]])
-    right = np.concatenate([-T @ centred, np.zeros(2)])
+    system = np.block([[joint + stay, A], [A.T, np.zeros((2, 2))]])
+    right = np.concatenate([-joint @ centred, np.zeros(2)])
     return log_exposures + np.linalg.solve(system, right)[:P]
 
 
@@ -220,7 +233,7 @@ def strictly_rising(g: Float, sigma: Float) -> Float:
         return g
     weights = 1 / np.maximum(sigma, 1e-6) ** 2
     risen = np.asarray(isotonic_regression(g - ramp, weights=weights).x, np.float64) + ramp
-    return risen - risen[len(g) // 2]
+    return risen
 
 
 @cache
@@ -233,9 +246,8 @@ def _compiled() -> Any:
     R = roughness(w)
 
     def one(H: Any, s: Any, tau: Any, smoothness: Any) -> Any:
-        M = s * H[:CODES, :CODES] + smoothness * R
-        right = -s * H[:CODES, CODES:] @ tau
-        M, right = M[jnp.ix_(keep, keep)], right[keep]
+        M = (s * H[:CODES, :CODES] + smoothness * R)[jnp.ix_(keep, keep)]
+        right = (-s * H[:CODES, CODES:] @ tau)[keep]
         d = 1 / jnp.sqrt(jnp.diag(M))
         scaled = M * d[:, None] * d
         factor = jax.scipy.linalg.cho_factor(scaled)
@@ -248,10 +260,8 @@ def _compiled() -> Any:
     return jax.jit(jax.vmap(one, in_axes=(0, 0, None, None)))
 
 
-def _solve(
-    H: Float, s: Float, tau: Float, smoothness: float
-) -> tuple[Float, Float, Float]:
-    """The curves (C, 256), M^-1 (C, 256, 256) with zeros at the middle code, conditions (C,)."""
+def _solve(H: Float, s: Float, tau: Float, smoothness: float) -> tuple[Float, Float, Float]:
+    """Curves (C, 256), M^-1 (C, 256, 256) with zeros at the middle code, conditions (C,)."""
     import jax
 
     with jax.enable_x64(True):
@@ -290,9 +300,7 @@ def _refuse(samples: Sequence[Sample], log_exposures: Float, smoothness: float) 
         raise UserError("all pictures are black: take longer exposures")
 
 
-def _refuse_few(
-    samples: Sequence[Sample], used: NDArray[np.int64], observed: Float
-) -> None:
+def _refuse_few(samples: Sequence[Sample], used: NDArray[np.int64], observed: Float) -> None:
     P, N = len(samples), int(used.min())
     if N * (P - 1) <= CODES - 1:
         raise UserError(

@@ -62,6 +62,19 @@ class Response:
     exposures: tuple[Exposed, ...] = ()
     record: Mapping[str, Any] = field(default_factory=dict[str, Any])
 
+    @classmethod
+    def from_log_exposure(cls, log_exposure: Float) -> Response:
+        """A curve that is known: (C, 256), or (256,) for grey; zero at code 128 afterwards."""
+        curves = np.atleast_2d(log_exposure)
+        curves = curves - curves[:, MIDDLE, None]
+        return cls(
+            channels=("R", "G", "B") if len(curves) == 3 else ("Y",),
+            log_exposure=curves,
+            sigma=np.zeros_like(curves),
+            weights=hat(),
+            code_noise=np.full(len(curves), 12**-0.5),
+        )
+
 
 def from_solution(
     solution: Solution,
@@ -114,9 +127,7 @@ def read_response(path: str | os.PathLike[str]) -> Response:
     try:
         return parse_response(Path(path).read_bytes(), path)
     except FileNotFoundError as error:
-        raise UserError(
-            "no such response; `hdr response` makes one", file=path
-        ) from error
+        raise UserError("no such response; `hdr response` makes one", file=path) from error
     except OSError as error:
         raise UserError(f"cannot be read: {error.strerror}", file=path) from error
 

@@ -15,7 +15,9 @@ from chromeball.scene.record import Stage, read_json, record_path
 
 app = App(name="hdr", help="Response curves and radiance maps from bracketed exposures.")
 
-type Inputs = Annotated[list[Path], Parameter(help="Pictures, take folders or take.json files.")]
+type Inputs = Annotated[
+    list[Path], Parameter(help="Pictures, take folders or take.json files.")
+]
 type Times = Annotated[
     str | None,
     Parameter(help="Exposure times in seconds, 1/30,1/60,...; else from takes or metadata."),
@@ -59,7 +61,7 @@ def response(
 ) -> None:
     """Recover the response of a camera from a bracket of 8-bit pictures (Debevec-Malik)."""
     from chromeball.hdr.bracket import pictures, read_bracket
-    from chromeball.hdr.response import SMOOTHNESS, sample, solve
+    from chromeball.hdr.response import SMOOTHNESS, Sample, sample, solve
     from chromeball.hdr.response_file import encode_response, from_solution, plot_response
 
     bracket = read_bracket(inputs, parse_times(times))
@@ -72,7 +74,8 @@ def response(
         patch=patch,
         refine_times=refine_times,
     ) as stage:
-        samples, channels = [], ()
+        samples: list[Sample] = []
+        channels: tuple[str, ...] = ()
         for picture in pictures(bracket, _tell):
             if picture.linear:
                 raise UserError(
@@ -160,9 +163,10 @@ def merge(
 ) -> None:
     """Merge a bracket into a scene-linear EXR; clipped pixels are marked and counted."""
     import numpy as np
+    from numpy.typing import NDArray
 
     from chromeball.hdr.bracket import pictures, read_bracket
-    from chromeball.hdr.merge import SENSOR_NOISE, merge_codes, merge_linear, preview, stops
+    from chromeball.hdr.merge import SENSOR_NOISE, merge_frames, merge_linear, preview, stops
     from chromeball.hdr.response_file import exposures_for, read_response
     from chromeball.scene.image import write_exr, write_picture
 
@@ -183,7 +187,9 @@ def merge(
         white=white,
         noise=noise,
     ) as stage:
-        frames, channels, linear = [], (), False
+        frames: list[NDArray[Any]] = []
+        channels: tuple[str, ...] = ()
+        linear = False
         for picture in pictures(bracket, _tell):
             frames.append(picture.pixels)
             channels, linear = picture.channels, picture.linear
@@ -211,17 +217,20 @@ def merge(
             if white is not None or noise is not None:
                 raise UserError("--white and --noise are for linear pictures: leave them out")
             assert curve is not None
-            merged = merge_codes(frames, exposures, curve, sigma=sigma)
+            merged = merge_frames(frames, exposures, curve, sigma=sigma)
         del frames
-        count = merged.pixels.shape[0] * merged.pixels.shape[1]
-        for marked, word, wish in ((merged.high, "saturated", "shorter"), (merged.low, "black", "longer")):
+        count = merged.radiance.shape[0] * merged.radiance.shape[1]
+        for marked, word, wish in (
+            (merged.high, "saturated", "shorter"),
+            (merged.low, "black", "longer"),
+        ):
             if np.all(marked == count):
                 raise UserError(f"every pixel is {word} in all pictures: take {wish} exposures")
         picture_path = output.with_name(output.stem + ".preview.png")
         stage.figures |= {
             "channels": channels,
             "pictures": len(bracket.frames),
-            "size": [merged.pixels.shape[1], merged.pixels.shape[0]],
+            "size": [merged.radiance.shape[1], merged.radiance.shape[0]],
             "exposure_scale": bracket.scale,
             "refined_exposures": refined,
             "clipped_high": merged.high,
@@ -230,12 +239,12 @@ def merge(
             "dynamic_range_stops": stops(merged),
             "preview": picture_path.name,
         }
-        planes, names = [merged.pixels], list(channels)
+        planes, names = [merged.radiance], list(channels)
         if merged.sigma is not None:
             planes.append(merged.sigma)
             names += [f"sigma.{name}" for name in channels]
             stage.figures["relative_sigma_median"] = float(
-                np.median((merged.sigma / merged.pixels)[merged.clipped == 0])
+                np.median((merged.sigma / merged.radiance)[merged.clipped == 0])
             )
         planes.append(merged.clipped[..., None].astype(np.float32))
         names.append("clipped")
