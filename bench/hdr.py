@@ -30,7 +30,7 @@ MAPS = (
     "openexr_StillLife",
     "polyhaven_city",
 )
-TIMES = 2.0 ** np.arange(-3, 4)
+TIMES: NDArray[np.float64] = np.exp2(np.arange(-3.0, 4.0))
 FULL_WELL, READ_NOISE = 15000.0, 5.0
 
 type Float = NDArray[np.float64]
@@ -124,7 +124,7 @@ def merge_rows(quick: bool) -> list[Row]:
             row.cpu_seconds,
             row.error,
             row.unit,
-            f"{7 * megapixels / row.cpu_seconds:.0f} MP/s, {row.cpu_seconds / ours:.1f} of ours",
+            f"{7 * megapixels / row.cpu_seconds:.0f} MP/s, {row.cpu_seconds / ours:.1f} x ours",
         )
         for row in found
     ]
@@ -143,7 +143,7 @@ def _opencv(tool: Any, frames: Frames) -> Float:
 
 
 def _curve(number: int) -> tuple[tuple[Float, Float], Float]:
-    """A DoRF curve as (irradiance, brightness), and the truth: ln exposure per code, (1, 256)."""
+    """A DoRF curve as (irradiance, brightness), and the true ln exposure per code, (1, 256)."""
     dorf = np.load(DATA / "dorf.npz")
     x = dorf["irradiance"][number].astype(np.float64)
     z = dorf["brightness"][number].astype(np.float64)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-TIMES = 2.0 ** np.arange(-3, 4)
+TIMES: NDArray[np.float64] = np.exp2(np.arange(-3.0, 4.0))
 
 
 def scene(height: int = 192, width: int = 256, seed: int = 3) -> NDArray[np.float64]:
