@@ -167,6 +167,6 @@ if __name__ == "__main__":
         default=128,
         help="paths a pixel of the view camera; the probe takes a quarter",
     )
-    parser.add_argument("--probe-size", type=int, default=1280, help="pixels of the probe")
+    parser.add_argument("--probe-size", type=int, default=640, help="pixels of the probe")
     arguments = parser.parse_args()
     photograph(arguments.folder, arguments.samples, arguments.probe_size)
