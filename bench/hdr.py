@@ -20,7 +20,7 @@ from bench.row import Row
 from chromeball.hdr.merge import merge_frames
 from chromeball.hdr.response import sample, solve
 from chromeball.hdr.response_file import Response
-from chromeball.scene.image import read_rgb
+from chromeball.scene.image import read_image
 
 DATA = Path(__file__).resolve().parents[1].parent / "shared/data/hdr"
 MAPS = (
@@ -153,7 +153,8 @@ def _curve(number: int) -> tuple[tuple[Float, Float], Float]:
 
 
 def _radiance(name: str, megapixels: float) -> Float:
-    picture = read_rgb(DATA / "radiance" / f"{name}.exr")
+    # some of the maps hold a few negative values: no light reaches the emulated sensor there
+    picture = np.maximum(read_image(DATA / "radiance" / f"{name}.exr").pixels[..., :3], 0)
     scale = np.sqrt(megapixels * 1e6 / (picture.shape[0] * picture.shape[1]))
     method = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
     resized = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=method)
