@@ -250,12 +250,13 @@ def _compiled() -> Any:
         right = (-s * H[:CODES, CODES:] @ tau)[keep]
         d = 1 / jnp.sqrt(jnp.diag(M))
         scaled = M * d[:, None] * d
-        factor = jax.scipy.linalg.cho_factor(scaled)
-        inverse = d[:, None] * jax.scipy.linalg.cho_solve(factor, jnp.diag(d))
-        g = jnp.zeros(CODES).at[keep].set(d * jax.scipy.linalg.cho_solve(factor, d * right))
-        full = jnp.zeros((CODES, CODES)).at[jnp.ix_(keep, keep)].set(inverse)
-        values = jnp.linalg.eigvalsh(scaled)
-        return g, full, values[-1] / values[0]
+        both = jnp.concatenate([jnp.diag(d), (d * right)[:, None]], axis=1)
+        solved = d[:, None] * jax.scipy.linalg.cho_solve(
+            (jnp.linalg.cholesky(scaled), True), both
+        )
+        g = jnp.zeros(CODES).at[keep].set(solved[:, -1])
+        inverse = jnp.zeros((CODES, CODES)).at[jnp.ix_(keep, keep)].set(solved[:, :-1])
+        return g, inverse, scaled
 
     return jax.jit(jax.vmap(one, in_axes=(0, 0, None, None)))
 
@@ -265,14 +266,15 @@ def _solve(H: Float, s: Float, tau: Float, smoothness: float) -> tuple[Float, Fl
     import jax
 
     with jax.enable_x64(True):
-        g, inverse, condition = _compiled()(H, s, tau, smoothness)
-        curves = np.asarray(g, np.float64)
-    if not np.all(np.isfinite(curves)):
+        found = _compiled()(H, s, tau, smoothness)
+        g, inverse, scaled = (np.asarray(part, np.float64) for part in found)
+    if not np.all(np.isfinite(g)):
         raise UserError(
             "the pictures do not determine a response (the matrix is singular): give more "
             "exposures, or a larger --smoothness"
         )
-    return curves, np.asarray(inverse), np.asarray(condition)
+    values = np.linalg.eigvalsh(scaled)  # numpy's: compiling JAX's costs seconds
+    return g, inverse, values[:, -1] / values[:, 0]
 
 
 def _code_noise(samples: Sequence[Sample], g: Float, log_exposures: Float) -> Float:

@@ -228,6 +228,8 @@ def plot_response(response: Response, path: str | os.PathLike[str]) -> None:
         error.semilogy(z[sigma > 0], sigma[sigma > 0], color=color, lw=1.2)
     curve.set(xlabel="code", ylabel="ln exposure", title="response, ± 2 standard errors")
     error.set(xlabel="code", ylabel="standard error of ln exposure", title="standard error")
+    low, high = response.log_exposure.min(), response.log_exposure.max()
+    curve.set_ylim(low - 0.1 * (high - low), high + 0.1 * (high - low))
     curve.legend(frameon=False)
     for axes in (curve, error):
         axes.grid(alpha=0.3)
