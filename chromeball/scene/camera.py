@@ -155,10 +155,10 @@ class CameraModel:
                 behind = p[..., 2] <= 0
                 q[behind], dq_dp[behind] = np.nan, np.nan
             return q, dq_dp
+        project = self._project_latlong if self.model == "latlong" else self._project_fisheye
         with np.errstate(divide="ignore", invalid="ignore"):
-            if self.model == "latlong":
-                return self._project_latlong(p)
-            return self._project_fisheye(p)
+            q, dq_dp = project(p.reshape(-1, 3))
+        return q.reshape(*p.shape[:-1], 2), dq_dp.reshape(*p.shape[:-1], 2, 3)
 
     def unproject(self, pixels: ArrayLike) -> NDArray[np.float64]:
         """Pixels to unit directions in camera axes, ``(..., 2) -> (..., 3)``; NaN outside."""
@@ -179,13 +179,13 @@ class CameraModel:
                 [np.sin(lon) * np.cos(lat), np.sin(lat), np.cos(lon) * np.cos(lat)], axis=-1
             )
         fx, fy, cx, cy, _ = self._fisheye_parameters()
-        x, y = (q[..., 0] - cx) / fx, (q[..., 1] - cy) / fy
+        x, y = ((q.reshape(-1, 2) - [cx, cy]) / [fx, fy]).T
         r = np.hypot(x, y)
         theta = self._angle(r)
         scale = np.where(r > 0, np.sin(theta) / np.where(r > 0, r, 1), 1.0)
         d = np.stack([x * scale, y * scale, np.cos(theta)], axis=-1)
         d[~(theta <= self.max_angle * (1 + 1e-9))] = np.nan
-        return d
+        return d.reshape(*q.shape[:-1], 3)
 
     # ---- in world axes
 
@@ -222,7 +222,9 @@ class CameraModel:
         """Read a ``.cameramodel``; a missing or broken one is a :class:`UserError`."""
         try:
             text = Path(path).read_text()
-            value: Any = ast.literal_eval(text.strip())
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", SyntaxWarning)
+                value: Any = ast.literal_eval(text.strip())
             rt = np.array(value.get("rt_cam_ref", value.get("extrinsics", np.zeros(6))), float)
             width, height = (int(n) for n in value["imagersize"])
             name = str(value["lensmodel"])
@@ -239,8 +241,18 @@ class CameraModel:
             raise UserError("no such camera model", file=path) from error
         except UserError as error:
             raise UserError(error.what, file=path) from error
-        except (OSError, SyntaxError, ValueError, TypeError, KeyError, AttributeError) as error:
-            reason = f"{type(error).__name__}: {error}"
+        except (
+            OSError,
+            SyntaxError,
+            ValueError,
+            TypeError,
+            KeyError,
+            AttributeError,
+            OverflowError,
+            MemoryError,  # the parser's word for brackets nested too deep
+            RecursionError,
+        ) as error:
+            reason = " ".join(f"{type(error).__name__}: {error}".split())
             raise UserError(f"not a readable camera model ({reason})", file=path) from error
 
     def text(self) -> str:

@@ -11,7 +11,6 @@ import math
 import os
 import re
 import tomllib
-from fractions import Fraction
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_type_hints
 
@@ -298,11 +297,12 @@ def parse_scene(text: str, path: str | os.PathLike[str] = "scene.toml") -> Scene
 def parse_time(value: float | str) -> float:
     """An exposure time in seconds from a number, "0.5" or "1/30"."""
     try:
-        seconds = float(Fraction(value)) if isinstance(value, str) else float(value)
+        numerator, slash, denominator = str(value).partition("/")
+        seconds = float(numerator) / (float(denominator) if slash else 1.0)
     except (ValueError, ZeroDivisionError, OverflowError) as error:
-        raise UserError(f"{value!r} is no exposure time: write 0.5 or 1/30") from error
+        raise UserError(f"{value!r:.40} is no exposure time: write 0.5 or 1/30") from error
     if not 0 < seconds < 1e6:
-        raise UserError(f"{value!r} is no exposure time: it must be positive and finite")
+        raise UserError(f"{value!r:.40} is no exposure time: it must be positive and finite")
     return seconds
 
 

@@ -42,7 +42,9 @@ class Pose:
     @classmethod
     def from_rotation_vector(cls, rotation: ArrayLike, translation: ArrayLike) -> Pose:
         """From an axis times angle in radians (Rodrigues) and a translation."""
-        v = np.asarray(rotation, float)
+        v = np.asarray(rotation, float).reshape(3)
+        if not np.isfinite(v).all():
+            raise ValueError("rotation is not finite")
         angle = float(np.linalg.norm(v))
         x, y, z = v / angle if angle > 0 else v
         k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
@@ -72,9 +74,17 @@ class Pose:
 
     def rotation_vector(self) -> NDArray[np.float64]:
         """Axis times angle in radians, (3,), angle in 0..pi."""
-        import cv2
-
-        return np.asarray(cv2.Rodrigues(self.rotation)[0], float).reshape(3)
+        r = self.rotation
+        v = np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]]) / 2
+        sine, cosine = float(np.linalg.norm(v)), (float(np.trace(r)) - 1) / 2
+        angle = float(np.arctan2(sine, cosine))
+        if cosine > 0:
+            return v * (angle / sine) if sine > 0 else v
+        # v fades towards half a turn; the symmetric part, cos I + (1 - cos) a a', does not.
+        outer = (r + r.T) / 2 - cosine * np.eye(3)
+        axis = outer[:, int(np.diagonal(outer).argmax())]
+        axis = axis / np.linalg.norm(axis)
+        return angle * (axis if axis @ v >= 0 else -axis)
 
     def inverse(self) -> Pose:
         """The pose that undoes this one."""
