@@ -142,7 +142,7 @@ def _build(entry: StandIn, camera: CameraModel | None) -> Piece:
         x, z = entry.size[0] / 2, entry.size[1] / 2
         given = np.array([[-x, -z], [-x, z], [x, z], [x, -z]])
     elif entry.points:
-        given = floor_points(_needed(camera), entry.points)
+        given = floor_points(_needed(camera), np.array(entry.points))
     else:
         given = np.array(entry.corners, float)
     ring = outline.ring(entry.outline, given)

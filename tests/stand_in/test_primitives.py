@@ -48,8 +48,8 @@ def volume(piece: Piece) -> float:
     st.lists(st.tuples(st.floats(-8, 8), st.floats(-8, 8)), min_size=1, max_size=8, unique=True)
 )
 def test_clicked_floor_points_are_found_again(places: list[tuple[float, float]]) -> None:
-    found = floor_points(MAP, clicks(on_floor(places)))
-    np.testing.assert_allclose(found, places, atol=1e-9)
+    found = floor_points(MAP, np.array(clicks(on_floor(places))))
+    np.testing.assert_allclose(found, np.array(places), atol=1e-9)
 
 
 @settings(deadline=None)
@@ -75,7 +75,7 @@ def test_a_click_beside_the_vertical_says_by_how_much() -> None:
 def test_metres_per_pixel_is_the_derivative() -> None:
     corner = np.array([[ORIGIN[0], ORIGIN[2] + 4.0]])
     x, y = clicks(np.array([[corner[0, 0], 0, corner[0, 1]]]))[0]
-    moved = floor_points(MAP, [(x, y - 0.005), (x, y + 0.005)])
+    moved = floor_points(MAP, [[x, y - 0.005], [x, y + 0.005]])
     slope = np.linalg.norm(moved[0] - moved[1]) / 0.01
     assert metres_per_pixel(MAP, corner) == pytest.approx(slope, rel=1e-4)
 
@@ -184,7 +184,7 @@ def test_pixels_that_see_no_floor_are_refused(
     pixels: list[tuple[float, float]], message: str
 ) -> None:
     with pytest.raises(UserError, match=message):
-        floor_points(MAP, pixels)
+        floor_points(MAP, np.array(pixels))
 
 
 @pytest.mark.parametrize(
