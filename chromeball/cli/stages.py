@@ -325,6 +325,7 @@ class _Planner:
             (
                 *("chromeball", "hdr", "response", *takes),
                 *(_option("smoothness", f"{smoothness:.10g}") if smoothness else ()),
+                *(("--refine-times",) if self.scene.hdr.refine_times else ()),
                 *("-o", output),
             ),
             {},
@@ -398,7 +399,7 @@ class _Planner:
         )
 
     def _env(self) -> str:
-        return self.scene.env.file or f"{self.build}/env.exr"
+        return f"{self.build}/env.exr"
 
     def _align(self) -> StagePlan:
         name = "envmap align"
@@ -406,7 +407,8 @@ class _Planner:
         if align is None:
             whose = "panorama's" if self.scene.env.file else "first shot's"
             return StagePlan(name, False, f"no [align]: the {whose} axes are the world's")
-        picture = self._env() if align.picture == "env" else f"{self.build}/{align.picture}.exr"
+        finished = self.scene.env.file if align.picture == "env" else None
+        picture = finished or f"{self.build}/{align.picture}.exr"
         inputs = [picture]
         if probe and probe.camera and align.picture != "env":
             inputs.append(probe.camera)
@@ -430,7 +432,16 @@ class _Planner:
         name = "envmap probe"
         scene, probe = self.scene, self.scene.probe
         if scene.env.file:
-            return StagePlan(name, False, f"{scene.env.file} is a finished panorama")
+            aligned = (f"{self.build}/align.json",) if scene.align else ()
+            return StagePlan(
+                name,
+                True,
+                f"{scene.env.file} is a finished panorama: turned to world axes, not stitched",
+                (scene.env.file, *aligned),
+                (self._env(),),
+                ("chromeball", "envmap", "probe", self.file, "-o", self._env()),
+                {"env": {"file": scene.env.file, "width": scene.env.width}},
+            )
         if probe is None:
             return StagePlan(name, False, "no [probe]")
         merged = [f"{self.build}/{shot.bracket}.exr" for shot in probe.shot]

@@ -60,12 +60,14 @@ class Bracket(Table, frozen=True):
 class Hdr(Table, frozen=True):
     """Response and merge. ``response``: a stored curve; else it is solved from ``solve_from``.
 
-    ``smoothness`` is Debevec and Malik's lambda.
+    ``smoothness`` is Debevec and Malik's lambda. ``refine_times``: the times of the metadata are
+    nominal; solve them too, the span from shortest to longest fixed.
     """
 
     response: str | None = None
     solve_from: list[Name] = []
     smoothness: Positive | None = None
+    refine_times: bool = False
 
 
 class Lens(Table, frozen=True):

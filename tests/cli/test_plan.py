@@ -73,6 +73,22 @@ def test_commands_are_the_explicit_forms(root: Path) -> None:
     assert plan["render main"].outputs == ("build/main.exr", "build/main.png")
 
 
+def test_a_finished_panorama_is_turned_and_not_stitched(root: Path) -> None:
+    text = changed("[probe]", '[env]\nfile = "sky.hdr"\n[probe]')
+    text = text.replace('picture = "front"', 'picture = "env"')
+    plan = planned(text, root)
+    assert plan["envmap align"].inputs == ("sky.hdr",)
+    assert plan["envmap probe"].inputs == ("sky.hdr", "build/align.json")
+    assert plan["envmap probe"].command[-2:] == ("-o", "build/env.exr")
+    assert "finished panorama" in plan["envmap probe"].reason
+    assert "build/env.exr" in plan["render main"].inputs
+
+
+def test_refined_times_reach_the_solver(root: Path) -> None:
+    text = changed("spp = 64", "spp = 64\n[hdr]\nrefine_times = true")
+    assert "--refine-times" in planned(text, root)["hdr response"].command
+
+
 def test_values_that_begin_with_a_minus_sign_are_tied_to_their_option(root: Path) -> None:
     text = changed('{ bracket = "front" }', '{ bracket = "front", yaw = -90 }')
     assert "--yaw=-90,-180" in planned(text, root)["envmap probe"].command
@@ -86,12 +102,6 @@ def test_values_that_begin_with_a_minus_sign_are_tied_to_their_option(root: Path
             'spp = 64\n[hdr]\nresponse = "old.json"',
             "hdr response",
             "old.json is given",
-        ),
-        (
-            "[probe]",
-            '[env]\nfile = "sky.hdr"\n[probe]',
-            "envmap probe",
-            "sky.hdr is a finished panorama",
         ),
         (
             "[probe]",
