@@ -24,7 +24,7 @@ type Array = NDArray[np.float64]
 
 #: Standard error of the tilt for clicks good to a pixel: warn above, refuse above.
 WARN_TILT = math.radians(1.5)
-REFUSE_TILT = math.radians(15)
+REFUSE_TILT = math.radians(20)
 
 
 @dataclass(frozen=True)
@@ -367,7 +367,7 @@ def overlay(
     """
     import cv2
 
-    picture = np.ascontiguousarray(display)
+    picture = np.array(display, np.uint8, order="C")
     thickness = max(1, round(max(camera.size) / 700))
     posed = camera.posed(alignment.world_from_camera)
     origin = alignment.world_from_camera.translation

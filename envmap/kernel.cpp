@@ -449,21 +449,24 @@ struct Warp {
     return Index(std::clamp(j, 0, from.height - 1)) * from.width + std::max(i, 0);
   }
 
-  // Whether neither the middle nor the corners of a target pixel see the source.
+  // Whether neither the middle nor the corners of a target pixel see the source. A pixel at the
+  // target's own rim, of which only a sliver is valid, is for `gather` to decide.
   bool unseen(float x, float y) const {
+    bool known = false;
     for (const auto& [u, v] : {std::pair{0.f, 0.f}, {-.49f, -.49f}, {.49f, -.49f}, {-.49f, .49f},
                                {.49f, .49f}}) {
       Vec d;
       float j, p, q;
-      if (to.unproject(x + u, y + v, d, j) && from.project(source_from_target * d, p, q))
-        return false;
+      if (!to.unproject(x + u, y + v, d, j)) continue;
+      known = true;
+      if (from.project(source_from_target * d, p, q)) return false;
     }
-    return true;
+    return known;
   }
 
   // Sub-samples across and down a target pixel: so many that no source pixel is passed over.
   std::pair<int, int> samples(int x, int y, float solid, float typical, bool smooth) const {
-    const float fx = float(x), fy = float(y), density = smooth ? 2.f : 1.25f;
+    const float fx = float(x), fy = float(y), density = smooth ? 2.f : 1.6f;
     Vec c, e, w, n, s;
     float j, u, v, cell = typical;
     const bool seen = to.unproject(fx, fy, c, j);
@@ -491,6 +494,39 @@ struct Warp {
     return {int(std::ceil(nx)), int(std::ceil(ny))};
   }
 
+  // The base in a direction of the target, and 1 in the fourth place; false where unseen.
+  bool base(Vec d, const Histospline* spline, Float4& value) const {
+    float x, y;
+    if (!from.project(source_from_target * d, x, y)) return false;
+    const Index cell = source_cell(x, y);
+    if (!valid.data()[cell]) return false;
+    if (spline) {
+      value = (*spline)(x, y);
+    } else {
+      const float* rgb = source.data() + 3 * cell;
+      const float s = base_share(rgb, cap);
+      value = Float4{s * rgb[0], s * rgb[1], s * rgb[2], 1};
+    }
+    value[3] = 1;
+    return true;
+  }
+
+  // A sliver at a disc's rim that all sub-samples miss takes the radiance of the nearest point.
+  void at_rim(int x, int y, const Histospline* spline, double (&sum)[3], double& got,
+              double& all) const {
+    if (to.kind != Projection::Kind::radial) return;
+    const float px = (float(x) - to.cx) / to.fx, py = (float(y) - to.cy) / to.fy;
+    const float s = 0.99999f * to.rim / std::sqrt(px * px + py * py);
+    Vec d;
+    float jacobian;
+    Float4 value;
+    if (!to.unproject(to.cx + s * px * to.fx, to.cy + s * py * to.fy, d, jacobian)) return;
+    all = 1;
+    if (!base(d, spline, value)) return;
+    got = 1;
+    for (int c = 0; c < 3; ++c) sum[c] = value[c];
+  }
+
   void gather(const Histospline* spline, float* out, float* coverage) const {
     double sum_solid = 0;
     Index seen = 0;
@@ -511,27 +547,17 @@ struct Warp {
           for (int a = 0; a < nx; ++a) {
             const float u = float(x) - 0.5f + (float(a) + 0.5f) / float(nx);
             Vec d;
-            float jacobian, p, q;
+            float jacobian;
             if (!to.unproject(u, v, d, jacobian)) continue;
             row_all += jacobian;
-            if (!from.project(source_from_target * d, p, q)) continue;
-            const Index cell = source_cell(p, q);
-            if (!valid.data()[cell]) continue;
             Float4 value;
-            if (spline) {
-              value = (*spline)(p, q);
-            } else {
-              const float* rgb = source.data() + 3 * cell;
-              const float s = base_share(rgb, cap);
-              value = Float4{s * rgb[0], s * rgb[1], s * rgb[2], 1};
-            }
-            value[3] = 1;
-            row += jacobian * value;
+            if (base(d, spline, value)) row += jacobian * value;
           }
           for (int c = 0; c < 3; ++c) sum[c] += row[c];
           got += row[3];
           all += row_all;
         }
+        if (all == 0) at_rim(x, y, spline, sum, got, all);
         if (got <= 0) continue;
         for (int c = 0; c < 3; ++c) out[3 * k + c] = float(std::max(sum[c] / got, 0.0));
         coverage[k] = float(std::min(got / all, 1.0));
@@ -700,6 +726,7 @@ using Result = nb::ndarray<nb::numpy, double, nb::ndim<2>>;
 }  // namespace
 
 NB_MODULE(kernel, m) {
+  nb::set_leak_warnings(false);  // a mapping kept in a global is no leak
   nb::class_<Projection>(m, "Projection")
       .def_static("latlong",
                   [](int width, int height) {

@@ -177,7 +177,7 @@ def _spread(moments: Array) -> Array:
     """E - |m|^2 / E: the energy's variance about its centroid on the sphere."""
     e = np.maximum(moments[..., 0], 0)
     m2 = np.sum(moments[..., 1:] ** 2, axis=-1)
-    return np.maximum(e - m2 / np.where(e > 0, e, 1), 0)
+    return np.asarray(np.maximum(e - m2 / np.where(e > 0, e, 1), 0))
 
 
 def _cut(

@@ -13,12 +13,12 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Self, override
+from typing import override
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from chromeball.envmap import kernel
+from chromeball.envmap.kernel import Projection
 from chromeball.scene.camera import FISHEYE_MODELS, WORLD_FROM_LATLONG, CameraModel
 from chromeball.scene.errors import UserError
 
@@ -36,7 +36,7 @@ class Mapping(ABC):
     size: tuple[int, int]
     rotation: Array = field(default_factory=lambda: WORLD_FROM_LATLONG.rotation)
 
-    def turned(self, world_from_camera: Array) -> Self:
+    def turned(self, world_from_camera: Array) -> Mapping:
         """The same picture, turned in the world."""
         return replace(self, rotation=np.asarray(world_from_camera, float))
 
@@ -54,7 +54,7 @@ class Mapping(ABC):
 
     @cached_property
     @abstractmethod
-    def kernel(self) -> kernel.Projection:
+    def kernel(self) -> Projection:
         """The same mapping for the C++ kernel."""
 
     def pixels_of(self, world: ArrayLike) -> Array:
@@ -101,8 +101,8 @@ class LatLong(Mapping):
 
     @cached_property
     @override
-    def kernel(self) -> kernel.Projection:
-        return kernel.Projection.latlong(*self.size)
+    def kernel(self) -> Projection:
+        return Projection.latlong(*self.size)
 
 
 #: Faces of the cube in camera axes: forward, right, down, and column and row in the cross.
@@ -165,8 +165,8 @@ class Cube(Mapping):
 
     @cached_property
     @override
-    def kernel(self) -> kernel.Projection:
-        return kernel.Projection.cube(*self.size)
+    def kernel(self) -> Projection:
+        return Projection.cube(*self.size)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -268,7 +268,7 @@ class Radial(Mapping):
 
     @cached_property
     @override
-    def kernel(self) -> kernel.Projection:
+    def kernel(self) -> Projection:
         theta = np.linspace(0, self.max_angle, _TABLE)
         u = np.linspace(0, 1, _TABLE)
         r = self.rim * (1 - (1 - u) ** 2)
@@ -281,7 +281,7 @@ class Radial(Mapping):
         cap = 2 * np.sin((t0 + t1) / 2) * np.sin((t1 - t0) / 2)
         density = cap / ((r1 - r0) * (r1 + r0) / 2)
         tables = (self.radius(theta), angle, density)
-        return kernel.Projection.radial(
+        return Projection.radial(
             *self.size,
             *self.focal,
             *self.centre,
@@ -333,7 +333,7 @@ class Lens(Mapping):
 
     @cached_property
     @override
-    def kernel(self) -> kernel.Projection:
+    def kernel(self) -> Projection:
         edge = np.linspace(-1, 1, _NODES)
         a, b = np.meshgrid(edge, edge)
         faces = [
@@ -341,7 +341,7 @@ class Lens(Mapping):
             for f, r, d, _ in FACES
         ]
         pixels = self._project_margin(np.stack(faces))
-        return kernel.Projection.table(
+        return Projection.table(
             *self.size,
             _NODES,
             np.ascontiguousarray(pixels, np.float32),
@@ -415,7 +415,9 @@ def of_camera(camera: CameraModel) -> Mapping:
 
     def angle(r: Array) -> Array:
         d = camera.unproject(np.stack([cx + fx * r, np.full_like(r, cy)], axis=-1))
-        return np.arctan2(np.hypot(d[..., 0], d[..., 1]), d[..., 2])
+        theta = np.arctan2(np.hypot(d[..., 0], d[..., 1]), d[..., 2])
+        # rounding at the rim
+        return np.where(np.isfinite(theta), theta, camera.max_angle)
 
     return Radial(
         camera.size,

@@ -85,12 +85,12 @@ def world_from_shots(
     """
     # camera axes: x right, y down, z forward are the world's -X, -Y, +Z
     base = WORLD_FROM_LATLONG.rotation
-    own = [base.T @ rotation(0, shot.pitch, shot.roll) @ base for shot in shots]
+    own = [base.T @ rotation(0.0, shot.pitch, shot.roll) @ base for shot in shots]
     if world_from_clicked is None:
-        return [rotation(s.yaw, 0, 0) @ base @ p for s, p in zip(shots, own, strict=True)]
+        return [rotation(s.yaw, 0.0, 0.0) @ base @ p for s, p in zip(shots, own, strict=True)]
     level = world_from_clicked @ own[clicked].T
     return [
-        rotation(s.yaw - shots[clicked].yaw, 0, 0) @ level @ p
+        rotation(s.yaw - shots[clicked].yaw, 0.0, 0.0) @ level @ p
         for s, p in zip(shots, own, strict=True)
     ]
 
@@ -152,7 +152,7 @@ def combine(
         total += weight[..., None] * result.radiance
         weights += weight
         alpha = np.maximum(alpha, result.coverage)
-        inner = (result.coverage > 0.999) & (weight > 0.01)
+        inner = (result.coverage > 0.999) & (weight > 5e-4)  # to 98.5 % of the rim
         if len(shots) > 1:
             seen.append((luminance(result.radiance).astype(np.float32), inner))
     known = weights > 0
@@ -203,7 +203,7 @@ def complete(radiance: NDArray[np.float32], missing: NDArray[np.bool_]) -> None:
         kernel = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
         return np.asarray(cv2.dilate(wide, kernel))[:, reach:-reach] > 0
 
-    border = near(6) & ~near(1.5)
+    border = near(6.0) & ~near(1.5)
     if not border.any():
         border = ~missing
     rows = np.nonzero(border.any(axis=1))[0]

@@ -2,7 +2,7 @@
 
 Reconstruction: a cubic histospline (its cell averages are the pixels) limited to stay above
 the smallest neighbour, so that nothing turns negative; where the target is at least twice as
-coarse, the pixels' own areas. What rises above 30 times the mean is scattered as energy.
+coarse, the pixels' own areas. What rises far above the mean is scattered as energy.
 """
 
 from __future__ import annotations
@@ -15,8 +15,10 @@ from numpy.typing import NDArray
 from chromeball.envmap import kernel
 from chromeball.envmap.mapping import Mapping
 
-#: A pixel's radiance above this many times the map's mean is scattered, not sampled.
-HOT = 30.0
+#: A pixel's radiance above this many times the map's mean is scattered, not sampled; fewer
+#: times in a small map, so that a pixel's sampled part is at most SHARE of the map's energy.
+HOT = (4.0, 30.0)
+SHARE = 1e-4
 
 
 @dataclass(frozen=True)
@@ -78,6 +80,8 @@ def warp(
     target_solid = target.solid_angles()
     if smooth is None:
         smooth = _density(target_solid) > _density(solid) / 2
+    pixels = covered * _density(solid) ** 2  # pixels in the map
+    cap = mean * float(np.clip(SHARE * pixels, *HOT)) if mean > 0 else 1.0
     turn = np.eye(3) if rotation is None else rotation
     source_from_target = source.rotation.T @ turn.T @ target.rotation
     out, coverage, hot, _, outside = kernel.warp(
@@ -88,7 +92,7 @@ def warp(
         source.kernel,
         target.kernel,
         np.ascontiguousarray(source_from_target),
-        HOT * mean if mean > 0 else 1.0,
+        cap,
         bool(smooth),
     )
     energy = np.einsum("hwc,hw->c", out, target_solid * coverage, dtype=np.float64)

@@ -1,0 +1,192 @@
+"""Every map: round trip, solid angles, handedness, the kernel against numpy."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from chromeball.envmap.mapping import (
+    MAPPINGS,
+    Mapping,
+    Radial,
+    make_mapping,
+    of_camera,
+    parse_lens,
+    pixel_grid,
+    sized,
+)
+from chromeball.scene.camera import CameraModel
+from chromeball.scene.errors import UserError
+
+OPENCV8 = [200.0, 202, 160, 118, -0.2, 0.05, 0.001, -0.001, 0, 0, 0, 0]
+
+
+def maps() -> dict[str, Mapping]:
+    found = {name: make_mapping(name, sized(name, 96)) for name in MAPPINGS}
+    size = (120, 100)
+    for model, fov in (("equisolid", 190), ("equidistant", 360), ("stereographic", 200)):
+        lens = CameraModel.fisheye(
+            model, size, math.radians(fov), centre=(58.3, 49.0), radius=48.0
+        )
+        found[model] = of_camera(lens)
+    found["orthographic"] = of_camera(CameraModel.fisheye("orthographic", (100, 100), 3.1))
+    kb4 = np.array([40.0, 42, 60, 48, -0.02, 0.003, 0, 0])
+    found["kb4"] = of_camera(CameraModel("kb4", kb4, size, max_angle=1.1))
+    found["pinhole"] = of_camera(CameraModel.pinhole((160, 120), 1.2))
+    found["opencv8"] = of_camera(
+        CameraModel("LENSMODEL_OPENCV8", np.array(OPENCV8), (320, 240))
+    )
+    return found
+
+
+MAPS = maps()
+#: Total solid angle of the maps that have a closed one.
+TOTALS = {
+    **dict.fromkeys(("latlong", "mirror", "angular", "cube", "equidistant"), 4 * math.pi),
+    "paraboloid": 2 * math.pi,
+    "equisolid": 2 * math.pi * (1 - math.cos(math.radians(95))),
+    "stereographic": 2 * math.pi * (1 - math.cos(math.radians(100))),
+    "orthographic": 2 * math.pi * (1 - math.cos(1.55)),
+    "pinhole": 4
+    * math.asin(
+        math.tan(0.6)
+        * math.tan(0.6)
+        * 0.75
+        / math.sqrt((1 + math.tan(0.6) ** 2) * (1 + (0.75 * math.tan(0.6)) ** 2))
+    ),
+}
+
+
+def sphere(count: int, seed: int = 0) -> np.ndarray:
+    d = np.random.default_rng(seed).normal(size=(count, 3))
+    return d / np.linalg.norm(d, axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize("name", MAPS)
+def test_round_trip(name: str) -> None:
+    mapping, d = MAPS[name], sphere(4000)
+    pixels = mapping.project(d)
+    seen = np.isfinite(pixels).all(axis=1)
+    assert seen.mean() > 0.02
+    np.testing.assert_allclose(mapping.unproject(pixels[seen]), d[seen], atol=1e-9)
+    if TOTALS.get(name) == 4 * math.pi:
+        assert seen.all()
+
+
+@pytest.mark.parametrize("name", TOTALS)
+def test_solid_angles_sum_to_the_total(name: str) -> None:
+    assert MAPS[name].solid_angles().sum() == pytest.approx(TOTALS[name], rel=1e-6)
+
+
+@pytest.mark.parametrize("name", MAPS)
+def test_solid_angle_of_a_pixel_by_sampling(name: str) -> None:
+    """Two routes: the exact sum against counting uniform directions."""
+    mapping = MAPS[name]
+    d = sphere(400_000, seed=3)
+    pixels = mapping.project(d)
+    width, height = mapping.size
+    with np.errstate(invalid="ignore"):
+        inside = np.isfinite(pixels).all(axis=1) & (pixels > -0.5).all(axis=1)
+        inside &= (pixels[:, 0] < width - 0.5) & (pixels[:, 1] < height - 0.5)
+    where = np.floor((pixels[inside] + 0.5) / np.array([width / 4, height / 4])).astype(int)
+    counts = np.zeros((4, 4))
+    np.add.at(counts, (where[:, 1], where[:, 0]), 1)
+    rows = (np.arange(height) * 4) // height
+    columns = (np.arange(width) * 4) // width
+    if width % 4 or height % 4:
+        pytest.skip("blocks do not fit the pixels")
+    blocks = np.zeros((4, 4))
+    np.add.at(blocks, (rows[:, None], columns[None, :]), mapping.solid_angles())
+    expected = blocks / (4 * math.pi) * len(d)
+    # five standard deviations of a count, sixteen blocks, eleven maps
+    assert (np.abs(counts - expected) <= 5 * np.sqrt(expected + 1)).all()
+
+
+def test_large_disc_takes_the_fast_route_to_the_same_solid_angles() -> None:
+    large = make_mapping("angular", (1024, 1024))
+    assert isinstance(large, Radial)
+    total = large.solid_angles()
+    assert total.sum() == pytest.approx(4 * math.pi, rel=1e-7)
+    small = make_mapping("angular", (256, 256)).solid_angles()
+    blocks = total.reshape(256, 4, 256, 4).sum(axis=(1, 3))
+    np.testing.assert_allclose(blocks, small, rtol=1e-5, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", MAPS)
+def test_kernel_agrees_with_numpy(name: str) -> None:
+    mapping, d = MAPS[name], sphere(5000, seed=1)
+    slow, fast = mapping.project(d), mapping.kernel.project(d)
+    both = np.isfinite(slow).all(axis=1) & np.isfinite(fast).all(axis=1)
+    assert both.sum() >= 0.98 * np.isfinite(fast).all(axis=1).sum()
+    np.testing.assert_allclose(fast[both], slow[both], atol=1e-3)
+    pixels = pixel_grid(mapping.size, 0.17).reshape(-1, 2)
+    pixels = pixels[(pixels < np.array(mapping.size) - 0.5).all(axis=1)]
+    there, back = mapping.unproject(pixels), mapping.kernel.unproject(pixels)[:, :3]
+    both = np.isfinite(there).all(axis=1) & np.isfinite(back).all(axis=1)
+    assert both.mean() > 0.3
+    # at the very rim of a mirror ball a float's pixel is 1e-4 rad
+    assert np.abs(there[both] - back[both]).max() < 3e-4
+    assert np.median(np.abs(there[both] - back[both])) < 5e-6
+
+
+@pytest.mark.parametrize("name", ["latlong", "angular", "paraboloid", "cube", "equisolid"])
+def test_orientation(name: str) -> None:
+    """Centre +Z, image right -X, up +Y."""
+    mapping = MAPS[name]
+    centre, right, up = mapping.pixels_of([[0, 0, 1], [-0.1, 0, 1], [0, 0.1, 1]])
+    assert right[0] > centre[0] + 0.5
+    assert right[1] == pytest.approx(centre[1], abs=1e-9)
+    assert up[1] < centre[1] - 0.5
+
+
+def test_mirror_ball_is_a_photograph_of_a_reflection() -> None:
+    """Against the law of reflection: camera far off on +Z, looking along -Z."""
+    mapping = MAPS["mirror"]
+    width, height = mapping.size
+    for x, y in ((70.0, 30.0), (20.0, 60.0), (48.0, 12.0)):
+        # camera right is +X, up +Y; the ball's outward normal at the pixel
+        nx, ny = (x - (width - 1) / 2) / (width / 2), -(y - (height - 1) / 2) / (height / 2)
+        n = np.array([nx, ny, math.sqrt(1 - nx * nx - ny * ny)])
+        ray = np.array([0, 0, -1.0])
+        reflected = ray - 2 * (ray @ n) * n
+        np.testing.assert_allclose(mapping.pixels_of(reflected), [x, y], atol=1e-9)
+    # and seeds.md P14: s = x / sqrt(2 (z + 1))
+    d = sphere(50, seed=2)
+    s = d[:, 0] / np.sqrt(2 * (d[:, 2] + 1))
+    np.testing.assert_allclose(mapping.pixels_of(d)[:, 0], s * 48 + 47.5, atol=1e-9)
+
+
+def test_angular_map_formula() -> None:
+    d = sphere(50, seed=4)
+    r = np.arccos(d[:, 2]) / (math.pi * np.hypot(d[:, 0], d[:, 1]))
+    np.testing.assert_allclose(
+        MAPS["angular"].pixels_of(d)[:, 0], -d[:, 0] * r * 48 + 47.5, atol=1e-6
+    )
+
+
+def test_lens_spec() -> None:
+    lens = parse_lens("equisolid:186:10,12,9", (30, 20))
+    assert lens.max_angle == pytest.approx(math.radians(93))
+    np.testing.assert_allclose(lens.intrinsics[1:], [10, 12])
+    rim = lens.project([[math.sin(math.radians(93)), 0, math.cos(math.radians(93))]])
+    np.testing.assert_allclose(rim, [[19, 12]])
+    only_radius = parse_lens("equidistant:180:,,8", (30, 20))
+    np.testing.assert_allclose(only_radius.intrinsics[1:], [14.5, 9.5])
+
+
+@pytest.mark.parametrize(
+    "spec", ["equisolid", "equisolid:x", "equisolid:0", "equisolid:186:1,2", "nope:180"]
+)
+def test_bad_lens_spec(spec: str) -> None:
+    with pytest.raises(UserError, match=r"--lens|unknown fisheye"):
+        parse_lens(spec, (10, 10))
+
+
+@pytest.mark.parametrize(
+    ("name", "size"), [("latlong", (100, 100)), ("mirror", (10, 9)), ("cube", (12, 8))]
+)
+def test_wrong_shape(name: str, size: tuple[int, int]) -> None:
+    with pytest.raises(UserError, match="must be"):
+        make_mapping(name, size)

@@ -1,0 +1,264 @@
+"""Resampling: a plain reference, constants, suns, rotation, validity, no negative values."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from chromeball.envmap.mapping import (
+    MAPPINGS,
+    LatLong,
+    Mapping,
+    make_mapping,
+    of_camera,
+    pixel_grid,
+    sized,
+)
+from chromeball.envmap.probe import rotation
+from chromeball.envmap.resample import warp
+from chromeball.scene.camera import CameraModel
+
+NAMES = [name for name in MAPPINGS if name != "paraboloid"]
+
+
+def fisheye(size: int, fov: float = 190.0) -> Mapping:
+    return of_camera(CameraModel.fisheye("equisolid", (size, size), math.radians(fov)))
+
+
+def truth(d: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A smooth radiance function of direction, (..., 3) -> (..., 3)."""
+    x, y, z = np.nan_to_num(d[..., 0]), np.nan_to_num(d[..., 1]), np.nan_to_num(d[..., 2])
+    return np.stack(
+        [1.2 + np.sin(4 * x + y), 1.5 + np.cos(5 * y) * z, 0.6 + 0.5 * np.sin(6 * z - 2 * x)],
+        axis=-1,
+    )
+
+
+def area_mean(mapping: Mapping, cut: int = 4) -> NDArray[np.float32]:
+    """Radiance of each pixel, averaged over cut x cut sub-samples."""
+    total = np.zeros((mapping.size[1], mapping.size[0], 3))
+    for j in range(cut):
+        for i in range(cut):
+            offset = np.array([i + 0.5, j + 0.5]) / cut - 0.5
+            d = mapping.unproject(pixel_grid(mapping.size) + offset) @ mapping.rotation.T
+            total += truth(d)
+    return (total / cut**2).astype(np.float32)
+
+
+def with_sun(
+    mapping: Mapping, sun: NDArray[np.float64], degrees: float = 0.5
+) -> NDArray[np.float32]:
+    radiance = truth(mapping.directions())
+    lit = np.nan_to_num(mapping.directions()) @ sun > math.cos(math.radians(degrees))
+    if not lit.any():
+        x, y = np.round(mapping.pixels_of(sun)).astype(int)
+        lit[min(y, mapping.size[1] - 1), x % mapping.size[0]] = True
+    radiance[lit] = 1e5
+    return radiance.astype(np.float32)
+
+
+def suns(count: int, seed: int) -> NDArray[np.float64]:
+    d = np.random.default_rng(seed).normal(size=(count, 3))
+    return d / np.linalg.norm(d, axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize("to", [*MAPPINGS, "fisheye"])
+@pytest.mark.parametrize("width", [24, 128])
+def test_constant_stays_constant(to: str, width: int) -> None:
+    source = LatLong((96, 48))
+    target = fisheye(width) if to == "fisheye" else make_mapping(to, sized(to, width))
+    result = warp(np.full((48, 96, 3), 0.7, np.float32), source, target)
+    seen = target.solid_angles() > 0
+    np.testing.assert_allclose(result.radiance[seen], 0.7, rtol=1e-5)
+    np.testing.assert_allclose(result.coverage[seen], 1)
+    assert (result.coverage[~seen] == 0).all()
+
+
+@pytest.mark.parametrize("to", NAMES)
+@pytest.mark.parametrize("width", [96, 320])
+def test_smooth_radiance_against_the_analytic_function(to: str, width: int) -> None:
+    source = LatLong((320, 160))
+    target = make_mapping(to, sized(to, width))
+    result = warp(area_mean(source, 2), source, target)
+    solid = target.solid_angles()
+    # the sub-samples of a reference pixel that a rim cuts are not comparable
+    whole = solid > 0.98 * np.median(solid[solid > 0]) if to != "latlong" else solid > 0
+    expected = area_mean(target)
+    inner = whole & np.isfinite(target.directions()).all(axis=2)
+    rms = np.sqrt(np.mean((result.radiance[inner] - expected[inner]) ** 2))
+    assert rms < 0.008
+
+
+@pytest.mark.parametrize("position", range(6))
+@pytest.mark.parametrize("width", [64, 256, 1024])
+def test_fisheye_to_latlong_keeps_a_sun(position: int, width: int) -> None:
+    """The bar: energy to 0.1 % with a sun of 1e5, up and down."""
+    sun = suns(6, 5)[position] * [1, 1, 0] + [0, 0, abs(suns(6, 5)[position][2])]
+    source = fisheye(320)
+    radiance = with_sun(source, sun)
+    result = warp(radiance, source, LatLong((width, width // 2)))
+    assert result.hot_pixels > 0
+    np.testing.assert_allclose(result.energy, result.source_energy, rtol=1e-3)
+    assert result.radiance.min() >= 0
+    assert (result.outside == 0).all()
+
+
+@pytest.mark.parametrize("to", NAMES)
+@pytest.mark.parametrize("width", [48, 320])
+def test_every_map_keeps_suns(to: str, width: int) -> None:
+    source = LatLong((256, 128))
+    target = make_mapping(to, sized(to, width))
+    poles = np.array([[0, 1, 0], [0, -1, 0], [0, 0, -1], [-1e-3, 0, -1]], float)
+    for sun in np.concatenate([suns(4, 6), poles]):
+        sun = sun / np.linalg.norm(sun)
+        result = warp(with_sun(source, sun, 1.5), source, target)
+        np.testing.assert_allclose(result.energy, result.source_energy, rtol=1e-3)
+        assert result.radiance.min() >= 0
+        # and where it was: the centroid of what is brighter than anything around
+        hot = result.radiance[..., 0] * target.solid_angles() * (result.radiance[..., 0] > 50)
+        centroid = np.einsum("hw,hwk->k", hot, np.nan_to_num(target.directions()))
+        cosine = centroid @ sun / np.linalg.norm(centroid)
+        pixel = math.sqrt(4 * math.pi / (target.solid_angles() > 0).sum())
+        assert cosine > math.cos(1.5 * pixel + math.radians(1))
+
+
+def test_hot_texels_alone_are_kept_exactly() -> None:
+    """A black map with one hot texel: all energy is scattered."""
+    source = LatLong((64, 32))
+    solid = source.solid_angles()
+    for y, x in ((16, 0), (0, 10), (31, 63), (9, 40)):
+        radiance = np.zeros((32, 64, 3), np.float32)
+        radiance[y, x] = [1e5, 5e4, 1e3]
+        for name in NAMES:
+            result = warp(radiance, source, make_mapping(name, sized(name, 160)))
+            np.testing.assert_allclose(result.energy, radiance[y, x] * solid[y, x], rtol=2e-3)
+
+
+def test_histospline_keeps_cell_averages_and_never_undershoots() -> None:
+    """Magnified by an integer, the mean over each source pixel is the pixel."""
+    rng = np.random.default_rng(8)
+    source = LatLong((64, 32))
+    radiance = (rng.random((32, 64, 3)) ** 6 * 20).astype(np.float32)
+    result = warp(radiance, source, LatLong((512, 256)), smooth=True)
+    cells = result.radiance.reshape(32, 8, 64, 8, 3)
+    middle = slice(6, 26)  # away from the poles, where area and angle part
+    np.testing.assert_allclose(
+        cells.mean(axis=(1, 3))[middle], radiance[middle], rtol=0.03, atol=0.03
+    )
+    padded = np.pad(radiance, ((1, 1), (0, 0), (0, 0)), mode="edge")
+    padded = np.pad(padded, ((0, 0), (1, 1), (0, 0)), mode="wrap")
+    lowest = np.min(
+        [padded[j : j + 32, i : i + 64] for j in range(3) for i in range(3)], axis=0
+    )
+    assert (cells[1:-1].min(axis=(1, 3)) >= lowest[1:-1] - 1e-4).all()
+
+
+def test_area_mode_against_a_plain_reference() -> None:
+    """Numpy: every source pixel's sub-samples fall into target pixels, weighted by area."""
+    rng = np.random.default_rng(9)
+    source, target = LatLong((256, 128)), make_mapping("angular", (32, 32))
+    radiance = rng.random((128, 256, 3)).astype(np.float32)
+    got = warp(radiance, source, target, smooth=False)
+    cut, total, weight = 12, np.zeros((32, 32, 3)), np.zeros((32, 32))
+    for j in range(cut):
+        for i in range(cut):
+            offset = np.array([i + 0.5, j + 0.5]) / cut - 0.5
+            pixels = pixel_grid((256, 128)) + offset
+            d = source.unproject(pixels)
+            area = np.cos(np.arcsin(np.clip(d[..., 1], -1, 1)))
+            q = np.floor(target.project(d) + 0.5).astype(int).clip(0, 31)
+            np.add.at(total, (q[..., 1], q[..., 0]), area[..., None] * radiance)
+            np.add.at(weight, (q[..., 1], q[..., 0]), area)
+    solid = target.solid_angles()
+    inner = solid > 0.3 * solid.max()
+    expected = total[inner] / weight[inner][:, None]
+    error = got.radiance[inner] - expected
+    assert np.sqrt(np.mean(error**2)) < 0.015  # the pixels themselves vary by 0.29
+
+
+def test_rotations_compose() -> None:
+    source = LatLong((256, 128))
+    a, b = rotation(0.7, -0.3, 0.2), rotation(-1.1, 0.4, 0.9)
+    radiance = area_mean(source, 2)
+    once = warp(radiance, source, source, rotation=b @ a).radiance
+    twice = warp(
+        warp(radiance, source, source, rotation=a).radiance, source, source, rotation=b
+    ).radiance
+    weight = source.solid_angles()[..., None]
+    assert math.sqrt(((once - twice) ** 2 * weight).sum() / weight.sum() / 3) < 3e-3
+    back = warp(once, source, source, rotation=(b @ a).T).radiance
+    assert math.sqrt(((back - radiance) ** 2 * weight).sum() / weight.sum() / 3) < 3e-3
+
+
+def test_rotation_turns_the_world() -> None:
+    """What lay ahead (+Z) moves to +X by a yaw of 90 degrees, up by a pitch."""
+    source = LatLong((64, 32))
+    radiance = with_sun(source, np.array([0, 0, 1.0]), 6)
+    for turn, place in (
+        (rotation(math.pi / 2, 0.0, 0.0), [1, 0, 0]),
+        (rotation(0.0, math.pi / 2, 0.0), [0, 1, 0]),
+    ):
+        result = warp(radiance, source, source, rotation=turn)
+        brightest = np.unravel_index(result.radiance[..., 0].argmax(), (32, 64))
+        assert source.directions()[brightest] @ np.array(place) > 0.98
+
+
+def test_turned_maps_and_validity() -> None:
+    source = fisheye(200, 180.0).turned(rotation(math.pi, 0.0, 0.0) @ fisheye(2).rotation)
+    valid = np.ones((200, 200), bool)
+    valid[:, :100] = False
+    radiance = np.ones((200, 200, 3), np.float32)
+    radiance[:, :100] = np.nan  # nothing of it may be read
+    target = LatLong((128, 64))
+    result = warp(radiance, source, target, valid=valid)
+    d = target.directions()
+    right = d[..., 0] > 0.05  # the right half of a picture that looks along -Z
+    behind = d[..., 2] < -0.05
+    assert result.coverage[right & behind].min() == pytest.approx(1)
+    assert result.coverage[(d[..., 0] < -0.05) | (d[..., 2] > 0.05)].max() == 0
+    np.testing.assert_allclose(result.radiance[right & behind], 1, rtol=1e-6)
+    seen = float((target.solid_angles() * result.coverage).sum())
+    assert seen == pytest.approx(math.pi, rel=0.005)
+
+
+def test_a_sun_the_target_does_not_see_is_counted() -> None:
+    source = LatLong((64, 32))
+    radiance = np.zeros((32, 64, 3), np.float32)
+    radiance[16, 0] = 1e4  # behind
+    result = warp(radiance, source, make_mapping("paraboloid", (32, 32)))
+    np.testing.assert_allclose(result.outside, result.source_energy, rtol=2e-2)
+    assert result.radiance.max() == 0
+
+
+def test_same_inputs_same_outputs() -> None:
+    source, target = fisheye(256), LatLong((200, 100))
+    radiance = with_sun(source, np.array([0.3, 0.5, 0.81]), 4)
+    first, again = (warp(radiance, source, target).radiance for _ in range(2))
+    assert (first == again).all()
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -1.0])
+def test_bad_radiance(value: float) -> None:
+    radiance = np.ones((16, 32, 3), np.float32)
+    radiance[3, 4, 1] = value
+    with pytest.raises(ValueError, match="negative or not finite"):
+        warp(radiance, LatLong((32, 16)), LatLong((16, 8)))
+
+
+def test_wrong_size() -> None:
+    with pytest.raises(ValueError, match="does not fit"):
+        warp(np.ones((16, 30, 3), np.float32), LatLong((32, 16)), LatLong((16, 8)))
+
+
+def test_black_and_enormous_maps() -> None:
+    source, target = LatLong((32, 16)), make_mapping("cube", (64, 48))
+    assert warp(np.zeros((16, 32, 3), np.float32), source, target).radiance.max() == 0
+    huge = np.full((16, 32, 3), 1e30, np.float32)
+    result = warp(huge, source, target)
+    np.testing.assert_allclose(result.radiance[target.solid_angles() > 0], 1e30, rtol=1e-5)
+    tiny = np.full((16, 32, 3), 1e-30, np.float32)
+    result = warp(tiny, source, target)
+    np.testing.assert_allclose(result.radiance[target.solid_angles() > 0], 1e-30, rtol=1e-5)
