@@ -1,7 +1,7 @@
 """One map to another, area-correct, with the energy of small bright lights kept.
 
 Reconstruction: a cubic histospline (its cell averages are the pixels) limited to stay above
-the smallest neighbour, so that nothing turns negative; where the target is at least twice as
+the smallest neighbour, so that nothing turns negative; where the target is half again as
 coarse, the pixels' own areas. What rises far above the mean is scattered as energy.
 """
 
@@ -79,7 +79,7 @@ def warp(
     mean = float((top * weight).sum()) / covered if covered > 0 else 0.0
     target_solid = target.solid_angles()
     if smooth is None:
-        smooth = _density(target_solid) > _density(solid) / 2
+        smooth = _density(target_solid) > _density(solid) / 1.5
     pixels = covered * _density(solid) ** 2  # pixels in the map
     cap = mean * float(np.clip(SHARE * pixels, *HOT)) if mean > 0 else 1.0
     turn = np.eye(3) if rotation is None else rotation
