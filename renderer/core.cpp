@@ -4,6 +4,7 @@
 #include <nanobind/stl/array.h>
 #include <nanobind/stl/optional.h>
 
+#include "composite.h"
 #include "path.h"
 
 namespace nb = nanobind;
@@ -13,9 +14,11 @@ namespace {
 
 using In3f = nb::ndarray<const float, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
 using In3u = nb::ndarray<const uint32_t, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
+using In4f = nb::ndarray<const float, nb::shape<-1, 4>, nb::c_contig, nb::device::cpu>;
 using In1f = nb::ndarray<const float, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
 using In1b = nb::ndarray<const uint8_t, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
 using Picture = nb::ndarray<const float, nb::shape<-1, -1, 3>, nb::c_contig, nb::device::cpu>;
+using InOut = nb::ndarray<float, nb::shape<-1, -1, Film::kCount>, nb::c_contig, nb::device::cpu>;
 using Out = nb::ndarray<nb::numpy, float, nb::ndim<3>>;
 
 template <typename Array>
@@ -50,6 +53,51 @@ struct MeshArrays {
   }
 };
 
+struct StandInArrays {
+  In3f vertices, original;
+  In3u faces;
+  In1b surface;
+
+  StandIn stand_in() const {
+    return {view(vertices), view(original), view(faces), view(surface)};
+  }
+};
+
+void check_faces(const In3u& faces, size_t vertices) {
+  for (const uint32_t i : view(faces)) {
+    if (i >= vertices) throw nb::value_error("face index out of range");
+  }
+}
+
+// The compositor with all that it looks at.
+class CompositorArrays {
+ public:
+  CompositorArrays(MeshArrays objects, In4f bounds, StandInArrays stand_in, Picture environment,
+                   std::array<float, 3> origin, int bounces, uint64_t seed, uint32_t samples)
+      : objects_(std::move(objects)), stand_in_(std::move(stand_in)) {
+    std::vector<Sphere> spheres;
+    for (size_t i = 0; i < bounds.shape(0); ++i) {
+      spheres.push_back({Vec3(bounds.data() + 4 * i), bounds.data()[4 * i + 3]});
+    }
+    nb::gil_scoped_release release;
+    environment_.emplace(environment.data(), int(environment.shape(0)),
+                         int(environment.shape(1)));
+    compositor_.emplace(objects_.mesh(), std::move(spheres), stand_in_.stand_in(),
+                        *environment_, Vec3(origin.data()), bounces, seed, samples);
+  }
+  const Compositor* operator->() const { return &*compositor_; }
+
+ private:
+  MeshArrays objects_;
+  StandInArrays stand_in_;
+  std::optional<Environment> environment_;
+  std::optional<Compositor> compositor_;
+};
+
+PixelRays pixel_rays(const Picture& corners) {
+  return {corners.data(), int(corners.shape(0)) - 1, int(corners.shape(1)) - 1};
+}
+
 }  // namespace
 
 NB_MODULE(core, m) {
@@ -62,9 +110,7 @@ NB_MODULE(core, m) {
                  ior.shape(0) != f || (normals && normals->shape(0) != vertices.shape(0))) {
                throw nb::value_error("arrays of one mesh differ in length");
              }
-             for (const uint32_t i : view(faces)) {
-               if (i >= vertices.shape(0)) throw nb::value_error("face index out of range");
-             }
+             check_faces(faces, vertices.shape(0));
              new (self) MeshArrays{vertices, normals, faces, albedo, emission, kind, ior};
            },
            nb::arg("vertices"), nb::arg("normals").none(), nb::arg("faces"), nb::arg("albedo"),
@@ -78,8 +124,7 @@ NB_MODULE(core, m) {
         if (irradiance && irradiance->shape(0) != arrays.vertices.shape(0)) {
           throw nb::value_error("irradiance and vertices differ in length");
         }
-        const PixelRays rays{corners.data(), int(corners.shape(0)) - 1,
-                             int(corners.shape(1)) - 1};
+        const PixelRays rays = pixel_rays(corners);
         NewPicture out(rays.height, rays.width, 3);
         {
           nb::gil_scoped_release release;
@@ -115,4 +160,58 @@ NB_MODULE(core, m) {
       },
       nb::arg("mesh"), nb::arg("points"), nb::arg("normals"), nb::arg("spp"), nb::arg("seed"),
       nb::arg("bounces"));
+
+  nb::class_<StandInArrays>(m, "StandIn")
+      .def("__init__",
+           [](StandInArrays* self, In3f vertices, In3f original, In3u faces, In1b surface) {
+             if (original.shape(0) != vertices.shape(0) || surface.shape(0) != faces.shape(0)) {
+               throw nb::value_error("arrays of one stand-in differ in length");
+             }
+             check_faces(faces, vertices.shape(0));
+             new (self) StandInArrays{vertices, original, faces, surface};
+           },
+           nb::arg("vertices"), nb::arg("original"), nb::arg("faces"), nb::arg("surface"));
+
+  nb::class_<CompositorArrays>(m, "Compositor")
+      .def(nb::init<MeshArrays, In4f, StandInArrays, Picture, std::array<float, 3>, int,
+                    uint64_t, uint32_t>(),
+           nb::arg("objects"), nb::arg("bounds"), nb::arg("stand_in"), nb::arg("environment"),
+           nb::arg("origin"), nb::arg("bounces"), nb::arg("seed"), nb::arg("samples"))
+      .def(
+          "add",
+          [](const CompositorArrays& self, Picture corners, std::array<float, 3> camera,
+             Picture plate, bool difference, uint32_t first, uint32_t count, InOut film) {
+            const PixelRays rays = pixel_rays(corners);
+            for (const auto& a : {std::pair(plate.shape(0), plate.shape(1)),
+                                  std::pair(film.shape(0), film.shape(1))}) {
+              if (int(a.first) != rays.height || int(a.second) != rays.width) {
+                throw nb::value_error("rays, plate and film differ in size");
+              }
+            }
+            nb::gil_scoped_release release;
+            return self->pass(rays, Vec3(camera.data()), plate.data(), difference, first, count,
+                              film.data());
+          },
+          nb::arg("corners"), nb::arg("camera"), nb::arg("plate"), nb::arg("difference"),
+          nb::arg("first"), nb::arg("count"), nb::arg("film"))
+      .def(
+          "background",
+          [](const CompositorArrays& self, Picture corners, std::array<float, 3> camera,
+             uint32_t count) {
+            const PixelRays rays = pixel_rays(corners);
+            NewPicture out(rays.height, rays.width, 3);
+            {
+              nb::gil_scoped_release release;
+              self->background(rays, Vec3(camera.data()), count, out.data);
+            }
+            return out.release();
+          },
+          nb::arg("corners"), nb::arg("camera"), nb::arg("count"))
+      .def(
+          "irradiance",
+          [](const CompositorArrays& self, std::array<float, 3> p, std::array<float, 3> n) {
+            const Vec3 E = self->irradiance(Vec3(p.data()), normalize(Vec3(n.data())));
+            return std::array{E.x, E.y, E.z};
+          },
+          nb::arg("point"), nb::arg("normal"));
 }

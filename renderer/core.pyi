@@ -32,3 +32,41 @@ def irradiance(
     seed: int,
     bounces: int,
 ) -> NDArray[float32]: ...
+
+class StandIn:
+    def __init__(
+        self,
+        vertices: NDArray[float32],
+        original: NDArray[float32],
+        faces: NDArray[uint32],
+        surface: NDArray[uint8],
+    ) -> None: ...
+
+class Compositor:
+    def __init__(
+        self,
+        objects: Mesh,
+        bounds: NDArray[float32],
+        stand_in: StandIn,
+        environment: NDArray[float32],
+        origin: tuple[float, float, float],
+        bounces: int,
+        seed: int,
+        samples: int,
+    ) -> None: ...
+    def add(
+        self,
+        corners: NDArray[float32],
+        camera: tuple[float, float, float],
+        plate: NDArray[float32],
+        difference: bool,
+        first: int,
+        count: int,
+        film: NDArray[float32],
+    ) -> int: ...
+    def background(
+        self, corners: NDArray[float32], camera: tuple[float, float, float], count: int
+    ) -> NDArray[float32]: ...
+    def irradiance(
+        self, point: tuple[float, float, float], normal: tuple[float, float, float]
+    ) -> list[float]: ...

@@ -36,41 +36,42 @@ std::vector<uint32_t> hilbert_order(int h, int w) {
   return order;
 }
 
-std::vector<float> row_solid_angles(int h, int w) {
-  std::vector<float> angle(h);
-  for (int y = 0; y < h; ++y) {
-    angle[y] = float(2 * M_PI / w * (std::cos(M_PI * y / h) - std::cos(M_PI * (y + 1) / h)));
-  }
-  return angle;
-}
-
-// Mean over each texel of the bilinear picture's brightness, the tent 1/8, 6/8, 1/8.
-std::vector<float> brightness(const std::vector<float>& rgb, int h, int w) {
-  std::vector<float> b(size_t(h) * w);
-  const auto at = [&](int y, int x) {
-    y = std::clamp(y, 0, h - 1), x = (x + w) % w;
-    return mean(Vec3(&rgb[3 * (size_t(y) * w + x)]));
+// What each texel has above the mean over the sphere, times its solid angle; the margin keeps
+// rounding from counting as light.
+std::vector<float> power_above_mean(const std::vector<float>& rgb, int h, int w) {
+  const auto solid_angle = [&](size_t t) {
+    const double y = double(t / w);
+    return 2 * M_PI / w * (std::cos(M_PI * y / h) - std::cos(M_PI * (y + 1) / h));
   };
-  tbb::parallel_for(0, h, [&](int y) {
-    for (int x = 0; x < w; ++x) {
-      float sum = 0;
-      for (int j = -1; j <= 1; ++j) {
-        for (int i = -1; i <= 1; ++i) {
-          sum += (j ? 1.0f / 8 : 6.0f / 8) * (i ? 1.0f / 8 : 6.0f / 8) * at(y + j, x + i);
-        }
-      }
-      b[size_t(y) * w + x] = sum;
-    }
-  });
-  return b;
+  std::vector<float> power(rgb.size() / 3);
+  double sum = 0;
+  for (size_t t = 0; t < power.size(); ++t) sum += mean(Vec3(&rgb[3 * t])) * solid_angle(t);
+  const double level = sum / (4 * M_PI) * (1 + 1e-5);
+  for (size_t t = 0; t < power.size(); ++t) {
+    power[t] = float(std::max(0.0, mean(Vec3(&rgb[3 * t])) - level) * solid_angle(t));
+  }
+  return power;
 }
 
-std::vector<float> ordered_power(const std::vector<float>& b,
-                                 const std::vector<float>& solid_angle,
-                                 const std::vector<uint32_t>& order, int w) {
-  std::vector<float> power(order.size());
-  for (size_t k = 0; k < order.size(); ++k) power[k] = b[order[k]] * solid_angle[order[k] / w];
-  return power;
+std::vector<float> reordered(const std::vector<float>& x, const std::vector<uint32_t>& order) {
+  std::vector<float> y(x.size());
+  for (size_t k = 0; k < x.size(); ++k) y[k] = x[order[k]];
+  return y;
+}
+
+struct Pixel {
+  float u, v;  // texel centres at integers
+};
+
+Pixel pixel_of(Vec3 d, int h, int w) {
+  const float lon = std::atan2(-d.x, d.z), lat = std::asin(std::clamp(-d.y, -1.0f, 1.0f));
+  return {(lon / (2 * kPi) + 0.5f) * w - 0.5f, (lat / kPi + 0.5f) * h - 0.5f};
+}
+
+Vec3 direction_of(Pixel p, int h, int w) {
+  const float lon = ((p.u + 0.5f) / w - 0.5f) * 2 * kPi, polar = (p.v + 0.5f) / h * kPi;
+  const float r = std::sin(polar);
+  return {-r * std::sin(lon), std::cos(polar), r * std::cos(lon)};
 }
 
 }  // namespace
@@ -79,48 +80,73 @@ Environment::Environment(const float* rgb, int h, int w)
     : h_(h),
       w_(w),
       rgb_(rgb, rgb + size_t(3) * h * w),
-      density_(brightness(rgb_, h, w)),
-      solid_angle_(row_solid_angles(h, w)),
+      probability_(power_above_mean(rgb_, h, w)),
       order_(hilbert_order(h, w)),
-      distribution_(ordered_power(density_, solid_angle_, order_, w)) {
-  const float scale = dark() ? 0.0f : float(1.0 / distribution_.sum());
-  for (float& d : density_) d *= scale;  // p(omega) = L / sum(L Omega)
+      distribution_(reordered(probability_, order_)) {
+  const float scale = even() ? 0.0f : float(1.0 / distribution_.sum());
+  for (float& p : probability_) p *= scale;
 }
 
-uint32_t Environment::texel_of(Vec3 d) const {
-  const float lon = std::atan2(-d.x, d.z), lat = std::asin(std::clamp(-d.y, -1.0f, 1.0f));
-  const int x = std::clamp(int((lon / (2 * kPi) + 0.5f) * w_), 0, w_ - 1);
-  const int y = std::clamp(int((lat / kPi + 0.5f) * h_), 0, h_ - 1);
-  return uint32_t(y) * w_ + x;
+Environment::Footprint Environment::footprint(float u, float v) const {
+  v = std::clamp(v, 0.0f, float(h_ - 1));
+  const int x = int(std::floor(u)), y = std::min(int(v), h_ - 1);
+  const float a = u - x, b = v - y;
+  const uint32_t x0 = x < 0 ? x + w_ : x, x1 = x + 1 < w_ ? x + 1 : 0;
+  const uint32_t r0 = uint32_t(y) * w_, r1 = uint32_t(std::min(y + 1, h_ - 1)) * w_;
+  return {{r0 + x0, r0 + x1, r1 + x0, r1 + x1},
+          {(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b}};
 }
 
 Vec3 Environment::radiance(Vec3 d) const {
-  const float lon = std::atan2(-d.x, d.z), lat = std::asin(std::clamp(-d.y, -1.0f, 1.0f));
-  const float u = (lon / (2 * kPi) + 0.5f) * w_ - 0.5f;
-  const float v = std::clamp((lat / kPi + 0.5f) * h_ - 0.5f, 0.0f, float(h_ - 1));
-  const int x = int(std::floor(u)), y = std::min(int(v), h_ - 1);
-  const float a = u - x, b = v - y;
-  const int x0 = x < 0 ? x + w_ : x, x1 = x0 + 1 < w_ ? x0 + 1 : 0, y1 = std::min(y + 1, h_ - 1);
-  const size_t r0 = size_t(y) * w_, r1 = size_t(y1) * w_;
-  const auto at = [&](size_t t) { return Vec3(&rgb_[3 * t]); };
-  return (1 - b) * ((1 - a) * at(r0 + x0) + a * at(r0 + x1)) +
-         b * ((1 - a) * at(r1 + x0) + a * at(r1 + x1));
+  const Pixel p = pixel_of(d, h_, w_);
+  const Footprint f = footprint(p.u, p.v);
+  Vec3 sum;
+  for (int k = 0; k < 4; ++k) sum += f.weight[k] * Vec3(&rgb_[3 * size_t(f.texel[k])]);
+  return sum;
 }
 
-Vec3 Environment::texel_direction(uint32_t t, float u, float v) const {
-  const int x = t % w_, y = t / w_;
-  const float lon = ((x + u) / w_ - 0.5f) * 2 * kPi;
-  // uniform in solid angle: the height is uniform
-  const float top = std::cos(kPi * y / h_), bottom = std::cos(kPi * (y + 1) / h_);
-  const float up = top + v * (bottom - top);
-  const float r = std::sqrt(std::max(0.0f, 1 - up * up));
-  return {-r * std::sin(lon), up, r * std::cos(lon)};
+uint32_t Environment::texel_of(Vec3 d) const {
+  const Pixel p = pixel_of(d, h_, w_);
+  const int x = std::clamp(int(p.u + 0.5f), 0, w_ - 1);
+  const int y = std::clamp(int(p.v + 0.5f), 0, h_ - 1);
+  return uint32_t(y) * w_ + x;
 }
 
+Vec3 Environment::texel_direction(uint32_t t) const {
+  return direction_of({float(t % w_), float(t / w_)}, h_, w_);
+}
+
+// The bilinear probability per texel area over the solid angle of that area.
+float Environment::density_at(float u, float v) const {
+  const Footprint f = footprint(u, v);
+  float p = 0;
+  for (int k = 0; k < 4; ++k) p += f.weight[k] * probability_[f.texel[k]];
+  const float r = std::sin((v + 0.5f) / h_ * kPi);
+  return r > 0 ? p * w_ * h_ / (2 * kPi * kPi * r) : 0;
+}
+
+float Environment::density(Vec3 d) const {
+  const Pixel p = pixel_of(d, h_, w_);
+  return density_at(p.u, p.v);
+}
+
+// A texel by its power, then a tent around it: the density is the bilinear map itself.
 Environment::Sample Environment::sample(uint32_t bits, float v) const {
   const auto pick = distribution_.sample(bits);
   const uint32_t t = order_[pick.index];
-  return {texel_direction(t, pick.rest, v), density_[t], t};
+  const auto tent = [](float x) {
+    return x < 0.5f ? std::sqrt(2 * x) - 1 : 1 - std::sqrt(2 - 2 * x);
+  };
+  const int row = int(t / w_);
+  Pixel p{float(t % w_) + tent(pick.rest), float(row) + tent(v)};
+  // beyond the first and last row's centres the map is constant up to the pole
+  if (p.v < 0) p.v = -v;
+  if (p.v > float(h_ - 1)) p.v = float(h_ - 1) + (1 - v);
+  if (p.u < -0.5f) p.u += w_;
+  if (p.u >= w_ - 0.5f) p.u -= w_;
+  const int x = std::clamp(int(p.u + 0.5f), 0, w_ - 1);
+  const int y = std::clamp(int(p.v + 0.5f), 0, h_ - 1);
+  return {direction_of(p, h_, w_), density_at(p.u, p.v), uint32_t(y) * w_ + x};
 }
 
 }  // namespace chromeball

@@ -48,6 +48,9 @@ class Distribution {
 };
 
 // A lat-long radiance map with OpenEXR's axes: centre +Z, image right -X, up +Y.
+//
+// Sampling is for use beside another strategy that covers all directions: its density is
+// proportional to what exceeds the map's mean (MIS compensation, Karlik et al. 2019).
 class Environment {
  public:
   // (h, w, 3) floats, row 0 is the zenith.
@@ -55,28 +58,33 @@ class Environment {
 
   int height() const { return h_; }
   int width() const { return w_; }
-  const Distribution& distribution() const { return distribution_; }
-  bool dark() const { return distribution_.empty(); }
+  // Nothing stands out of the mean, so that there is nothing to sample by importance.
+  bool even() const { return distribution_.empty(); }
 
   Vec3 radiance(Vec3 d) const;  // bilinear; d of unit length
-  Vec3 texel(uint32_t t) const { return Vec3(&rgb_[3 * size_t(t)]); }
-  float density(Vec3 d) const { return density_[texel_of(d)]; }  // 1/sr
-  float texel_density(uint32_t t) const { return density_[t]; }
-  float texel_solid_angle(uint32_t t) const { return solid_angle_[t / w_]; }
-  Vec3 texel_direction(uint32_t t, float u, float v) const;  // u, v in 0..1 inside the texel
+  float density(Vec3 d) const;  // of `sample`, 1/sr
+  Vec3 texel_direction(uint32_t t) const;  // through its centre
   uint32_t texel_of(Vec3 d) const;
 
   struct Sample {
     Vec3 direction;
-    float density;  // 1/sr
-    uint32_t texel;
+    float density;  // 1/sr, follows the bilinear map
+    uint32_t texel;  // that the direction lies in
   };
   Sample sample(uint32_t bits, float v) const;
 
  private:
+  // Bilinear weights around (u, v), texel centres at integers.
+  struct Footprint {
+    uint32_t texel[4];
+    float weight[4];
+  };
+  Footprint footprint(float u, float v) const;
+  float density_at(float u, float v) const;
+
   int h_, w_;
   std::vector<float> rgb_;
-  std::vector<float> density_, solid_angle_;
+  std::vector<float> probability_;  // of each texel
   std::vector<uint32_t> order_;  // texels along a Hilbert curve: near in order, near in space
   Distribution distribution_;
 };

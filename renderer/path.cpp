@@ -17,7 +17,7 @@ class PathIntegrator {
   PathIntegrator(const Mesh& mesh, const Environment* environment, int bounces,
                  const float* irradiance = nullptr, float gather_from = 0)
       : mesh_(mesh),
-        environment_(environment && !environment->dark() ? environment : nullptr),
+        environment_(environment),
         emitters_(power(mesh)),
         bounces_(bounces),
         irradiance_(irradiance),
@@ -26,7 +26,8 @@ class PathIntegrator {
       accel_.add(mesh.vertices.data(), mesh.vertices.size() / 3, mesh.faces.data(), mesh.size());
     }
     accel_.commit();
-    pick_environment_ = !environment_ ? 0.0f : emitters_.empty() ? 1.0f : 0.5f;
+    const bool sky = environment_ && !environment_->even();
+    pick_environment_ = !sky ? 0.0f : emitters_.empty() ? 1.0f : 0.5f;
     // area density of a point on an emitter: (power / area) / sum of powers
     if (!emitters_.empty()) inverse_power_ = float(1.0 / emitters_.sum());
   }

@@ -61,8 +61,7 @@ class SampleTable {
       const uint64_t a = mix64(seed * 0x9e3779b97f4a7c15u + 2 * k + 1);
       const uint64_t b = mix64(a);
       for (uint32_t i = 0; i < size_; ++i) {
-        const uint32_t j = owen(reverse_bits(i), uint32_t(b));
-        const uint32_t shuffled = reverse_bits(j) & (size_ - 1);
+        const uint32_t shuffled = owen(i, uint32_t(b)) & (size_ - 1);
         values_[2 * (size_t(k) * size_ + i)] = owen(sobol0(shuffled), uint32_t(a));
         values_[2 * (size_t(k) * size_ + i) + 1] = owen(sobol1(shuffled), uint32_t(a >> 32));
       }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 from typing import Any
 
@@ -74,29 +75,63 @@ def read_mesh(path: str | os.PathLike[str]) -> Triangles:
     library: Any = pymeshlab  # its classes come at run time
 
     meshes = library.MeshSet()
+    points = [np.zeros((0, 3), np.float32)]
+    corners = [np.zeros((0, 3), np.int64)]
     try:
-        meshes.load_new_mesh(os.fspath(path), load_in_a_single_layer=True)
-        mesh = meshes.current_mesh()
-        vertices = np.asarray(mesh.vertex_matrix(), np.float32)
-        faces: NDArray[np.int64] = np.asarray(mesh.face_matrix()).astype(np.int64)
+        meshes.load_new_mesh(os.fspath(path))
+        first = 0
+        for mesh in meshes:  # glTF and its like hold several, each with its own place
+            points.append(np.asarray(mesh.transformed_vertex_matrix(), np.float32))
+            corners.append(np.asarray(mesh.face_matrix()).astype(np.int64) + first)
+            first += len(points[-1])
     except library.PyMeshLabException as error:
-        raise UserError(f"not a readable mesh: {error}", file=path) from error
+        reason = str(error).strip().splitlines()
+        raise UserError(
+            f"not a readable mesh: {reason[-1] if reason else 'unknown format'}", file=path
+        ) from error
+    vertices, faces = np.concatenate(points), np.concatenate(corners)
+    bad = int((~np.isfinite(vertices).all(axis=1)).sum())
+    # MeshLab leaves broken vertices out without a word
+    bad += max(0, _declared_vertices(path) - len(vertices))
+    if bad:
+        raise UserError(f"{bad} vertices are NaN or infinite; repair the mesh", file=path)
     if len(faces) == 0:
         raise UserError("the mesh has no faces", file=path)
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise UserError(
             f"a face names a vertex that is not among the {len(vertices)}", file=path
         )
-    bad = ~np.isfinite(vertices).all(axis=1)
-    if bad.any():
-        raise UserError(
-            f"{int(bad.sum())} vertices are NaN or infinite, the first is {int(bad.argmax())}",
-            file=path,
-        )
     keep = face_areas(vertices, faces) > 0
     if not keep.any():
         raise UserError("no face of the mesh has an area", file=path)
     return vertices, faces[keep].astype(np.uint32), None
+
+
+def _declared_vertices(path: Path) -> int:
+    """How many vertices a PLY or OBJ file says it has; 0 for other formats.
+
+    Raises UserError for an OBJ face that names a vertex that is not there, which MeshLab also
+    leaves out.
+    """
+    match path.suffix.lower():
+        case ".ply":
+            header = path.read_bytes()[:65536].partition(b"end_header")[0]
+            found = re.search(rb"element vertex (\d+)", header)
+            return int(found[1]) if found else 0
+        case ".obj":
+            data = path.read_bytes()
+            count = len(re.findall(rb"^[ \t]*v[ \t]", data, re.MULTILINE))
+            for line in re.findall(rb"^[ \t]*f[ \t]+(.*)", data, re.MULTILINE):
+                for corner in line.split():
+                    number = corner.partition(b"/")[0]
+                    index = int(number) if number.lstrip(b"-").isdigit() else 0
+                    if not 0 < abs(index) <= count:
+                        raise UserError(
+                            f"a face names vertex {index}, the mesh has {count}", file=path
+                        )
+            return count
+        case _:
+            return 0
 
 
 def face_areas(vertices: NDArray[np.float32], faces: NDArray[np.int64]) -> NDArray[np.float64]:

@@ -1,0 +1,101 @@
+#include "captured.h"
+
+#include <tbb/blocked_range.h>
+#include <tbb/parallel_for.h>
+
+namespace chromeball {
+
+Captured::Captured(const StandIn& stand_in, const Environment& environment, Vec3 origin)
+    : stand_in_(stand_in), environment_(environment), origin_(origin) {
+  if (!stand_in.size()) {
+    accel_.commit();
+    return;
+  }
+  const size_t v = stand_in.vertices.size() / 3;
+  accel_.add(stand_in.vertices.data(), v, stand_in.faces.data(), stand_in.size());
+  accel_.commit();
+
+  Accel original;  // the set as it was when the map was captured
+  original.add(stand_in.original.data(), v, stand_in.faces.data(), stand_in.size());
+  original.commit();
+  const uint32_t texels = uint32_t(environment.height()) * environment.width();
+  planes_.resize(texels);
+  tbb::parallel_for(tbb::blocked_range<uint32_t>(0, texels, 4096), [&](const auto& range) {
+    const FlushDenormals flush;
+    for (uint32_t t = range.begin(); t < range.end(); ++t) {
+      const Hit hit = original.intersect(origin, environment.texel_direction(t));
+      if (!hit) continue;
+      bool moved = false;
+      for (int k = 0; k < 3; ++k) {
+        moved |= !is_zero(stand_in.corner(hit.face, k) - stand_in.original_corner(hit.face, k));
+      }
+      const Vec3 n = normalize(hit.ng);
+      planes_[t] = {n, moved ? NAN : dot(n, stand_in.corner(hit.face, 0))};
+    }
+  });
+}
+
+Place Captured::trace(Vec3 o, Vec3 d, float tfar) const {
+  if (accel_.empty()) return {};
+  const Hit hit = accel_.intersect(o, d, tfar);
+  if (!hit) return {};
+  const auto at = [&](auto corner) {
+    const Vec3 a = corner(0);
+    return a + hit.u * (corner(1) - a) + hit.v * (corner(2) - a);
+  };
+  Place place;
+  place.t = hit.t;
+  place.face = hit.face;
+  place.p = at([&](int k) { return stand_in_.corner(hit.face, k); });
+  place.captured_at = at([&](int k) { return stand_in_.original_corner(hit.face, k); });
+  const Vec3 n = normalize(hit.ng);
+  place.n = dot(n, d) < 0 ? n : -n;
+  place.support = stand_in_.surface[hit.face] == 0;
+  return place;
+}
+
+Vec3 Captured::radiance(const Place& place, Vec3 d) const {
+  if (!place) return environment_.radiance(d);
+  return environment_.radiance(normalize(place.captured_at - origin_));
+}
+
+float Captured::jacobian(Vec3 x, Vec3 q, Vec3 n) const {
+  const Vec3 from_o = q - origin_, from_x = q - x;
+  const float o2 = length2(from_o), x2 = length2(from_x);
+  const float cos_o = std::abs(dot(from_o, n)) / std::sqrt(o2);
+  const float cos_x = std::abs(dot(from_x, n)) / std::sqrt(x2);
+  return cos_x > 1e-6f ? cos_o * x2 / (o2 * cos_x) : 0;
+}
+
+Captured::Sample Captured::sample(Vec3 x, Pair u) const {
+  if (environment_.even()) return {};
+  const Environment::Sample s = environment_.sample(u.bits, u.y);
+  if (planes_.empty()) return {s.direction, kInfinity, s.density};
+  const Plane& plane = planes_[s.texel];
+  if (is_zero(plane.n)) return {s.direction, kInfinity, s.density};
+  // q = o + z w, the light's place
+  const float z = (plane.offset - dot(plane.n, origin_)) / dot(plane.n, s.direction);
+  if (!(z > 0 && z < kInfinity)) return {};
+  const Vec3 q = origin_ + z * s.direction, to = q - x;
+  const float t = length(to);
+  if (!(t > 1e-5f)) return {};
+  return {to * (1 / t), t, s.density * jacobian(x, q, plane.n)};
+}
+
+float Captured::density(Vec3 x, Vec3 d, const Place& place) const {
+  if (environment_.even()) return 0;
+  if (!place) {
+    const bool infinite = planes_.empty() || is_zero(planes_[environment_.texel_of(d)].n);
+    return infinite ? environment_.density(d) : 0;
+  }
+  const Vec3 from_o = place.p - origin_;
+  const float distance = length(from_o);
+  if (!(distance > 0)) return 0;
+  const Vec3 w = from_o * (1 / distance);
+  const Plane& plane = planes_[environment_.texel_of(w)];
+  const float off = dot(plane.n, place.p) - plane.offset;
+  if (is_zero(plane.n) || !(std::abs(off) < 1e-4f * (1 + distance))) return 0;
+  return environment_.density(w) * jacobian(x, place.p, plane.n);
+}
+
+}  // namespace chromeball

@@ -1,0 +1,83 @@
+// The captured light: a lat-long map around a point, laid on the stand-in geometry, so that
+// light comes from places instead of directions (seeds F11, F12).
+#pragma once
+
+#include <span>
+#include <vector>
+
+#include "embree.h"
+#include "light.h"
+#include "sampler.h"
+
+namespace chromeball {
+
+// Views of arrays that the caller keeps alive.
+struct StandIn {
+  std::span<const float> vertices;   // (V, 3)
+  std::span<const float> original;   // (V, 3), where each stood when the map was captured
+  std::span<const uint32_t> faces;   // (F, 3)
+  std::span<const uint8_t> surface;  // (F,) 0 support, 1 environment
+
+  size_t size() const { return surface.size(); }
+  Vec3 corner(uint32_t face, int k) const { return Vec3(&vertices[3 * faces[3 * face + k]]); }
+  Vec3 original_corner(uint32_t face, int k) const {
+    return Vec3(&original[3 * faces[3 * face + k]]);
+  }
+};
+
+// The first stand-in surface on a ray, or the infinite environment.
+struct Place {
+  float t = kInfinity;
+  Vec3 p, n;        // n: unit, on the ray's side
+  Vec3 captured_at;  // where p stood when the map was captured
+  uint32_t face = 0;
+  bool support = false;
+  explicit operator bool() const { return t < kInfinity; }
+};
+
+class Captured {
+ public:
+  Captured(const StandIn& stand_in, const Environment& environment, Vec3 origin);
+
+  Place trace(Vec3 o, Vec3 d, float tfar = kInfinity) const;
+  bool blocked(Vec3 o, Vec3 d, float tfar) const { return accel_.occluded(o, d, tfar); }
+  bool positional() const { return !accel_.empty(); }
+  const StandIn& stand_in() const { return stand_in_; }
+
+  // L_cap: the radiance that the map holds for a place, or for a direction to infinity.
+  Vec3 radiance(const Place& place, Vec3 d) const;
+
+  // Importance sampling of the light seen from x.
+  struct Sample {
+    Vec3 d;
+    float t = 0;        // distance of the light, infinite for a direction, 0: no light
+    float density = 0;  // 1/sr at x
+    explicit operator bool() const { return density > 0; }
+  };
+  Sample sample(Vec3 x, Pair u) const;
+  // Whether `place`, the first on the ray, is what the sample was aimed at.
+  static bool reaches(const Sample& sample, const Place& place) {
+    if (sample.t == kInfinity) return !place;
+    return place && std::abs(place.t - sample.t) < 1e-3f * sample.t;
+  }
+  // The density with which `sample` picks direction d, whose first place is `place`.
+  float density(Vec3 x, Vec3 d, const Place& place) const;
+
+ private:
+  // The plane that a texel's centre shows: n . q = offset; n = 0 for the infinite environment,
+  // offset NaN where a stand-in was moved from under its light (never sampled).
+  struct Plane {
+    Vec3 n;
+    float offset = 0;
+  };
+  // d omega_o / d omega_x through the surface element at q with normal n.
+  float jacobian(Vec3 x, Vec3 q, Vec3 n) const;
+
+  StandIn stand_in_;
+  const Environment& environment_;
+  Vec3 origin_;
+  Accel accel_;
+  std::vector<Plane> planes_;
+};
+
+}  // namespace chromeball

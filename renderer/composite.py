@@ -1,0 +1,219 @@
+"""Synthetic objects in a captured set: the plate, changed where the objects change it.
+
+For a place x on a support surface the plate is multiplied by Q = 1 + dE / E_without per
+channel, dE being what the objects add to and take from its irradiance: differential rendering
+(Debevec 1998) as a quotient, inside one pass. The light comes from places: the map's texels
+are laid on the stand-in geometry (Felinto et al. 2012, section 7). Where no sample sees an
+object Q is 1 without noise, and the plate's bits are left alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chromeball.renderer import core
+from chromeball.renderer.mesh import Mesh, Values
+from chromeball.stand_in.ply import StandInMesh
+
+#: Channels of the film, as in the C++ core's `Film`.
+_OBJECT, _CHANGE, _DIFFERENCE = slice(0, 3), slice(4, 7), slice(7, 10)
+_COVERAGE, _SUPPORT, _DEPTH, _SURFACES, _SQUARE, _BRIGHTNESS, _COUNT = 3, 10, 11, 12, 13, 14, 15
+#: Bounding spheres that the core looks at one by one.
+_MOST_SPHERES = 32
+
+
+@dataclass(frozen=True)
+class CapturedSet:
+    """What was captured: light and the geometry it lies on.
+
+    ``environment`` (h, w, 3) float32 lat-long radiance, OpenEXR's axes in the world;
+    ``origin`` (3,) the map's place in metres; ``stand_in`` triangles of the set. Without
+    stand-in geometry all light is directional and there is nothing to cast shadows on.
+    """
+
+    environment: NDArray[np.float32]
+    origin: NDArray[np.float64]
+    stand_in: StandInMesh | None = None
+
+
+@dataclass(frozen=True)
+class Composite:
+    """A composite and what it is made of, all of the plate's height and width.
+
+    ``rgb`` (H, W, 3) scene-linear; ``alpha`` (H, W) share of the pixel that objects cover;
+    ``quotient`` (H, W, 3) mean Q of the pixel's support part, 1 elsewhere; ``objects``
+    (H, W, 3) radiance of the objects times alpha; ``standard_error`` (H, W) of the pixel's
+    mean brightness; ``depth`` (H, W) mean distance of the first surface in metres, 0 where
+    there is none; ``changed`` (H, W) bool, the other pixels are the plate's bits.
+    ``clipped``: pixels whose noise would have made them negative, set to 0.
+    """
+
+    rgb: NDArray[np.float32]
+    alpha: NDArray[np.float32]
+    quotient: NDArray[np.float32]
+    objects: NDArray[np.float32]
+    standard_error: NDArray[np.float32]
+    depth: NDArray[np.float32]
+    changed: NDArray[np.bool_]
+    clipped: int
+
+    def relative_error(self) -> float:
+        """Typical standard error of a changed pixel over the mean of them all; 0 if none."""
+        if not self.changed.any():
+            return 0.0
+        mean = float(self.rgb[self.changed].mean())
+        rms = float(np.sqrt(np.mean(self.standard_error[self.changed].astype(float) ** 2)))
+        return rms / mean if mean > 0 else 0.0
+
+
+class Compositor:
+    """A progressive compositor: :meth:`add` samples, look at :meth:`result`, go on.
+
+    Parameters
+    ----------
+    objects
+        The synthetic objects; an empty list leaves the plate alone.
+    captured
+        The set's light and geometry.
+    rays
+        (H + 1, W + 1, 3) float32 directions at the pixels' corners
+        (:func:`chromeball.renderer.path.corner_rays`); NaN outside the lens.
+    camera
+        The camera's place in metres.
+    plate
+        (H, W, 3) float32 radiance of the background; none: the captured set itself, seen by
+        the camera (``plate_samples`` sub-samples a pixel).
+    bounces
+        Diffuse interreflections between objects and set beyond direct light. Paths through
+        mirrors and glass are always followed.
+    mode
+        ``quotient``: B Q, ``difference``: B + L_cap dE / E_without.
+    samples
+        About how many samples a pixel are to come: the order of the points is made for it.
+
+    """
+
+    def __init__(
+        self,
+        objects: Sequence[Mesh],
+        captured: CapturedSet,
+        rays: NDArray[np.float32],
+        camera: Values,
+        plate: NDArray[np.float32] | None = None,
+        *,
+        bounces: int = 4,
+        mode: Literal["quotient", "difference"] = "quotient",
+        seed: int = 0,
+        samples: int = 64,
+        plate_samples: int = 16,
+    ) -> None:
+        self._rays = np.ascontiguousarray(rays, np.float32)
+        self._camera = _triple(camera)
+        self._difference = mode == "difference"
+        self._core = core.Compositor(
+            Mesh.join(objects).core(),
+            _bounds(objects),
+            _core_stand_in(captured.stand_in),
+            np.ascontiguousarray(captured.environment, np.float32),
+            _triple(captured.origin),
+            bounces,
+            seed,
+            samples,
+        )
+        if plate is None:
+            plate = self._core.background(self._rays, self._camera, plate_samples)
+        self.plate = np.ascontiguousarray(plate, np.float32)
+        height, width = self._rays.shape[0] - 1, self._rays.shape[1] - 1
+        if self.plate.shape != (height, width, 3):
+            raise ValueError(f"plate is {self.plate.shape}, rays are for {height} x {width}")
+        self._film = np.zeros((height, width, _COUNT), np.float32)
+        #: samples a pixel so far, rays traced so far
+        self.samples, self.rays_traced = 0, 0
+
+    def add(self, samples: int) -> None:
+        """Add `samples` sub-samples to each pixel."""
+        self.rays_traced += self._core.add(
+            self._rays,
+            self._camera,
+            self.plate,
+            self._difference,
+            self.samples,
+            samples,
+            self._film,
+        )
+        self.samples += samples
+
+    def irradiance(self, point: Values, normal: Values) -> NDArray[np.float64]:
+        """E_without (3,) of the captured set at a point lifted off a surface."""
+        return np.array(self._core.irradiance(_triple(point), _triple(normal)))
+
+    def result(self) -> Composite:
+        """The composite of the samples so far."""
+        film, n = self._film, np.float32(max(self.samples, 1))
+        alpha = film[..., _COVERAGE] / n
+        objects = film[..., _OBJECT] / n
+        change = film[..., _CHANGE] / n
+        added = film[..., _DIFFERENCE] / n if self._difference else self.plate * change
+        changed = (alpha > 0) | (change != 0).any(axis=2)
+        blend = self.plate * (1 - alpha[..., None]) + objects + added
+        clipped = changed & (blend < 0).any(axis=2)
+        rgb = np.where(changed[..., None], np.maximum(blend, 0), self.plate)
+        support = film[..., _SUPPORT, None]
+        quotient = np.ones_like(rgb)
+        np.divide(film[..., _CHANGE], support, out=quotient, where=support > 0)
+        quotient += support[..., 0, None] > 0
+        surfaces = film[..., _SURFACES]
+        depth = np.zeros_like(alpha)
+        np.divide(film[..., _DEPTH], surfaces, out=depth, where=surfaces > 0)
+        mean = film[..., _BRIGHTNESS].astype(float) / n
+        variance = np.maximum(film[..., _SQUARE].astype(float) / n - mean**2, 0)
+        error = np.where(changed, np.sqrt(variance / max(float(n) - 1, 1)), 0)
+        return Composite(
+            rgb=rgb,
+            alpha=_float32(alpha),
+            quotient=quotient,
+            objects=_float32(objects),
+            standard_error=_float32(error),
+            depth=_float32(depth),
+            changed=changed,
+            clipped=int(clipped.sum()),
+        )
+
+
+def _triple(value: Values) -> tuple[float, float, float]:
+    x, y, z = (float(v) for v in np.asarray(value, float))
+    return x, y, z
+
+
+def _float32(values: NDArray[np.floating]) -> NDArray[np.float32]:
+    return values.astype(np.float32, copy=False)
+
+
+def _bounds(objects: Sequence[Mesh]) -> NDArray[np.float32]:
+    """Bounding spheres (N, 4), centre and radius, a little large against rounding."""
+    clouds = [m.vertices[np.unique(m.faces)] for m in objects if len(m.faces)]
+    if len(clouds) > _MOST_SPHERES:
+        clouds = [np.concatenate(clouds)]
+    spheres = np.empty((len(clouds), 4), np.float32)
+    for sphere, points in zip(spheres, clouds, strict=True):
+        sphere[:3] = (points.min(axis=0) + points.max(axis=0)) / 2
+        radius = np.linalg.norm(points - sphere[:3], axis=1).max()
+        sphere[3] = radius * (1 + 1e-4) + 1e-6
+    return spheres
+
+
+def _core_stand_in(mesh: StandInMesh | None) -> core.StandIn:
+    if mesh is None:
+        none = np.zeros((0, 3), np.float32)
+        return core.StandIn(none, none, np.zeros((0, 3), np.uint32), np.zeros(0, np.uint8))
+    return core.StandIn(
+        np.ascontiguousarray(mesh.vertices, np.float32),
+        np.ascontiguousarray(mesh.original, np.float32),
+        np.ascontiguousarray(mesh.faces, np.uint32),
+        np.ascontiguousarray(mesh.surface, np.uint8),
+    )

@@ -1,0 +1,51 @@
+// E_without: the irradiance that the support surfaces receive in the set as it was captured.
+#pragma once
+
+#include <atomic>
+#include <memory>
+
+#include "captured.h"
+
+namespace chromeball {
+
+// Solved on a lattice over each support plane where it is asked for, bilinear in between. All
+// points use the same well-spread samples, so that what error is left is smooth.
+class Irradiance {
+ public:
+  Irradiance(const Captured& captured, uint64_t seed);
+
+  // At a support place; n is its normal on the side that is lit.
+  Vec3 at(const Place& place) const;
+  // The same without the lattice.
+  Vec3 solve(Vec3 p, Vec3 n) const;
+
+ private:
+  static constexpr uint32_t kSamples = 512;  // of each of the two strategies
+  static constexpr int kCells = 80;          // along the diagonal of a plane
+
+  struct Node {
+    std::atomic<uint8_t> ready{0};
+    Vec3 value;
+  };
+  struct Lattice {  // on one side of one plane
+    Vec3 corner, s, t, n;  // node (i, j) lies at corner + step (i s + j t)
+    float step;
+    int width, height;
+    std::unique_ptr<Node[]> nodes;
+    std::unique_ptr<std::atomic<uint8_t>[]> cells;  // 0 unknown, 1 open, 2 cut by a wall
+
+    Vec3 node_place(int i, int j) const {
+      return lift(corner + step * (float(i) * s + float(j) * t), n);
+    }
+  };
+  bool is_open(const Lattice& lattice, int i, int j) const;
+  Vec3 node(const Lattice& lattice, int i, int j) const;
+
+  const Captured& captured_;
+  SampleTable table_;
+  std::vector<uint32_t> group_;  // of each face: its plane
+  mutable std::vector<Lattice> lattices_;  // two a plane: along its normal and against it
+  std::vector<Vec3> normals_;
+};
+
+}  // namespace chromeball

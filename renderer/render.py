@@ -1,0 +1,253 @@
+"""A view of a scene file, rendered: the composite, its layers and how good they are."""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chromeball.renderer.composite import CapturedSet, Composite, Compositor
+from chromeball.renderer.path import corner_rays
+from chromeball.renderer.scene import object_meshes
+from chromeball.scene.camera import CameraModel
+from chromeball.scene.color import luminance
+from chromeball.scene.errors import UserError
+from chromeball.scene.image import read_image, read_rgb, to_display, write_exr, write_picture
+from chromeball.scene.manifest import Scene, View
+from chromeball.scene.pose import Pose
+from chromeball.scene.record import Stage
+from chromeball.stand_in.ply import read_stand_in
+
+#: Samples of one progressive pass.
+_PASS = 8
+
+
+@dataclass(frozen=True)
+class Budget:
+    """When to stop: after `spp` samples a pixel, `seconds`, or below a relative `error`."""
+
+    spp: int | None = None
+    seconds: float | None = None
+    error: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("spp", "seconds", "error"):
+            value = getattr(self, name)
+            if value is not None and not (value > 0 and math.isfinite(value)):
+                raise UserError(f"--{name} is {value}; it must be positive")
+        if self.error is not None and self.spp is None and self.seconds is None:
+            object.__setattr__(self, "spp", 65536)  # an end for an error out of reach
+
+    def reached(self, samples: int, seconds: float, error: Callable[[], float]) -> bool:
+        """Whether to stop now; `error` is only asked for where it matters."""
+        return (
+            (self.spp is not None and samples >= self.spp)
+            or (self.seconds is not None and seconds >= self.seconds)
+            or (self.error is not None and samples >= 2 * _PASS and error() <= self.error)
+        )
+
+
+@dataclass(frozen=True)
+class Job:
+    """What a view is made of, read and checked. ``inputs``: the files it came from."""
+
+    name: str
+    compositor: Compositor
+    size: tuple[int, int]
+    exposure: float | None
+    inputs: tuple[Path, ...]
+
+
+def prepare(scene: Scene, folder: Path, view: View, spp: int) -> Job:
+    """Read everything a view needs and build the compositor.
+
+    Paths are relative to `folder`, the scene file's; `spp` is the number of samples expected.
+
+    Raises
+    ------
+    UserError
+        When an input is missing or broken, or plate and camera differ in size.
+
+    """
+    build = folder / scene.folder
+    env_file = build / "env.exr"
+    environment = read_rgb(env_file)
+    if environment.shape[1] != 2 * environment.shape[0]:
+        raise UserError("a lat-long map is twice as wide as high", file=env_file)
+    origin = _origin(env_file)
+    inputs = [env_file]
+    stand_in = None
+    if scene.stand_in:
+        inputs.append(build / "stand_in.ply")
+        stand_in = read_stand_in(inputs[-1])
+    plate = None
+    if view.bracket or view.plate:
+        plate_file = build / f"{view.bracket}.exr" if view.bracket else folder / str(view.plate)
+        camera_file = build / f"{view.name}.cameramodel"
+        inputs += [plate_file, camera_file]
+        plate = read_rgb(plate_file)
+        camera = CameraModel.read(camera_file)
+        if camera.size != (plate.shape[1], plate.shape[0]):
+            raise UserError(
+                f"the camera is for {camera.size[0]} x {camera.size[1]} pixels, the plate has "
+                f"{plate.shape[1]} x {plate.shape[0]}",
+                file=camera_file,
+            )
+    else:
+        camera = virtual_camera(view, origin)
+    inputs += [folder / o.mesh for o in scene.object if (folder / o.mesh).is_file()]
+    compositor = Compositor(
+        object_meshes(scene, folder),
+        CapturedSet(environment, origin, stand_in),
+        corner_rays(camera),
+        camera.world_from_camera.translation,
+        plate,
+        bounces=scene.render.bounces,
+        mode=scene.render.composite,
+        seed=scene.render.seed,
+        samples=spp,
+    )
+    return Job(view.name, compositor, camera.size, view.exposure, tuple(inputs))
+
+
+def virtual_camera(view: View, origin: NDArray[np.float64]) -> CameraModel:
+    """The camera of a view without a plate: at the map's origin, turned to ``look_at``.
+
+    A ``latlong`` view keeps the world's axes, as env.exr.
+    """
+    if view.model == "latlong":
+        camera = CameraModel.latlong(view.size)
+        return camera.posed(Pose(camera.world_from_camera.rotation, origin))
+    target = np.array(view.look_at, float)
+    up = np.array([0.0, 1.0, 0.0])
+    if np.linalg.norm(np.cross(target - origin, up)) < 1e-6:
+        up = np.array([0.0, 0.0, -1.0])  # straight down or up
+    try:
+        pose = Pose.look_at(origin, target, up)
+    except ValueError as error:
+        raise UserError(
+            f"view {view.name!r}: look_at is the place of the light probe; choose another point"
+        ) from error
+    fov = math.radians(view.fov)
+    if view.model == "pinhole":
+        if fov >= math.radians(179):
+            raise UserError(f"view {view.name!r}: a pinhole has a fov below 179 degrees")
+        return CameraModel.pinhole(view.size, fov, pose)
+    return CameraModel.fisheye(view.model, view.size, fov, pose=pose)
+
+
+def accumulate(
+    compositor: Compositor,
+    budget: Budget,
+    progress: Callable[[int, float], None] | None = None,
+) -> Composite:
+    """Passes until the budget is reached; `progress` gets samples and seconds so far."""
+    start = time.perf_counter()
+    while True:
+        left = _PASS if budget.spp is None else min(_PASS, budget.spp - compositor.samples)
+        compositor.add(left)
+        seconds = time.perf_counter() - start
+        if progress is not None:
+            progress(compositor.samples, seconds)
+        if budget.reached(
+            compositor.samples, seconds, lambda: compositor.result().relative_error()
+        ):
+            return compositor.result()
+
+
+def render_view(
+    scene: Scene,
+    scene_file: str | os.PathLike[str],
+    view: View,
+    budget: Budget,
+    output: str | os.PathLike[str] | None = None,
+    progress: Callable[[int, float], None] | None = None,
+) -> dict[str, object]:
+    """Render one view into an EXR with its layers and a PNG beside it; its figures.
+
+    The EXR holds R G B A, ``quotient.R G B``, ``objects.R G B`` (premultiplied),
+    ``error.Y`` (standard error of the brightness) and ``depth.Z`` in metres.
+    """
+    folder = Path(scene_file).parent
+    target = Path(output) if output else folder / scene.folder / f"{view.name}.exr"
+    if target.suffix.lower() != ".exr":
+        raise UserError("the composite is an EXR file; name it so", file=target)
+    if budget == Budget():
+        budget = replace(budget, spp=scene.render.spp)
+    spp = budget.spp if budget.spp is not None and budget.spp < 4096 else 256
+    job = prepare(scene, folder, view, spp)
+    inputs = [Path(scene_file), *job.inputs]
+    with Stage("render", inputs, view=view.name, seed=scene.render.seed) as stage:
+        start = time.perf_counter()
+        composite = accumulate(job.compositor, budget, progress)
+        seconds = time.perf_counter() - start
+        exposure = job.exposure or automatic_exposure(composite.rgb)
+        png = target.with_suffix(".png")
+        changed = composite.changed
+        with np.errstate(divide="ignore", invalid="ignore"):
+            relative = composite.standard_error / composite.rgb.mean(axis=2)
+        relative = relative[changed & np.isfinite(relative)]
+        clipped = (composite.rgb * exposure > 1).any(axis=2)
+        stage.figures |= {
+            "spp": job.compositor.samples,
+            "seconds": seconds,
+            "mrays_per_second": job.compositor.rays_traced / max(seconds, 1e-9) / 1e6,
+            "median_standard_error": float(np.median(relative)) if relative.size else 0.0,
+            "relative_error": composite.relative_error(),
+            "changed_pixels": int(changed.sum()),
+            "coverage": float(composite.alpha.mean()),
+            "clipped_negative_pixels": composite.clipped,
+            "clipped_png_pixels": int(clipped.sum()),
+            "exposure": exposure,
+            "png": png.name,
+        }
+        with stage.output(target) as temporary:
+            _write_layers(temporary, composite)
+        with stage.output(png) as temporary:
+            write_picture(temporary, to_display(composite.rgb, exposure))
+    return dict(stage.figures)
+
+
+def automatic_exposure(rgb: NDArray[np.float32]) -> float:
+    """Exposure that shows the middle of the picture's brightness as middle grey.
+
+    The geometric mean between median and 90th percentile goes to 0.25, black left out.
+    """
+    brightness = luminance(rgb)
+    brightness = brightness[brightness > 0]
+    if brightness.size == 0:
+        return 1.0
+    middle, bright = np.percentile(brightness, [50, 90])
+    return float(0.25 / math.sqrt(middle * bright))
+
+
+def _origin(env_file: Path) -> NDArray[np.float64]:
+    value = read_image(env_file).attributes.get("origin")
+    origin = np.zeros(0) if value is None else np.array(value, float).reshape(-1)
+    if origin.shape != (3,) or not np.isfinite(origin).all():
+        raise UserError(
+            "has no attribute `origin` (x, y, z of the light probe in metres); "
+            "make it with `envmap probe`",
+            file=env_file,
+        )
+    return origin
+
+
+def _write_layers(path: Path, composite: Composite) -> None:
+    layers = {
+        "RGB": composite.rgb,
+        "A": composite.alpha,
+        "quotient": composite.quotient,
+        "objects": composite.objects,
+        "error": composite.standard_error,
+        "depth": composite.depth,
+    }
+    names = {"RGB": list("RGB"), "A": ["A"], "error": ["error.Y"], "depth": ["depth.Z"]}
+    channels = [c for k in layers for c in names.get(k, [f"{k}.{c}" for c in "RGB"])]
+    write_exr(path, np.dstack(list(layers.values())), channels=channels)
