@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +16,28 @@ from chromeball.scene.errors import UserError
 from chromeball.scene.image import read_image, to_display, write_picture
 
 
-def read_radiance(
-    path: str | os.PathLike[str],
-) -> tuple[NDArray[np.float32], NDArray[np.bool_] | None, dict[str, Any]]:
-    """Read (H, W, 3) radiance, where it is valid, and the attributes worth keeping.
+@dataclass(frozen=True)
+class Radiance:
+    """A scene-linear picture.
+
+    ``rgb`` (H, W, 3) float32; ``valid`` (H, W), or None for all; ``clipped`` (H, W) marks lower
+    bounds, saturated in every exposure, or None where the file does not say; ``attributes``
+    worth keeping.
+    """
+
+    rgb: NDArray[np.float32]
+    valid: NDArray[np.bool_] | None
+    clipped: NDArray[np.bool_] | None
+    attributes: dict[str, Any]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height in pixels."""
+        return self.rgb.shape[1], self.rgb.shape[0]
+
+
+def read_radiance(path: str | os.PathLike[str]) -> Radiance:
+    """Read a scene-linear picture with its validity.
 
     Pixels whose alpha is 0, NaN or infinite pixels under alpha 0 included, are not valid;
     without an alpha channel all are (None).
@@ -58,7 +77,8 @@ def read_radiance(
         for name in ("chromaticities", "whiteLuminance", "origin")
         if name in image.attributes
     }
-    return np.ascontiguousarray(rgb), valid, kept
+    clipped = pixels[..., names.index("clipped")] > 0 if "clipped" in names else None
+    return Radiance(np.ascontiguousarray(rgb), valid, clipped, kept)
 
 
 def latlong_attributes(kept: Mapping[str, Any], origin: Any = None) -> dict[str, Any]:

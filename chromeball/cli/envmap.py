@@ -94,8 +94,8 @@ def warp(
         raise UserError("neither map is a fisheye: --lens and --camera have no use")
     if fisheyes == 2 and to_lens is None:
         raise UserError("--to-lens is missing: both maps are fisheyes")
-    radiance, valid, kept = read_radiance(picture)
-    size = (radiance.shape[1], radiance.shape[0])
+    image = read_radiance(picture)
+    size, kept = image.size, dict(image.attributes)
     if from_ == "fisheye":
         source = _fisheye(lens, camera, size, picture)
     else:
@@ -110,11 +110,11 @@ def warp(
     )
     with Stage("envmap warp", [picture, *([camera] if camera else [])], to=to) as stage:
         result = resample(
-            radiance,
+            image.rgb,
             source,
             target,
             rotation=rotation(*(math.radians(a) for a in angles)),
-            valid=valid,
+            valid=image.valid,
         )
         stage.figures |= {
             "size": target.size,
@@ -353,8 +353,8 @@ def lights(
 
     if count < 1:
         raise UserError(f"--count {count}: at least one light")
-    radiance, _, kept = read_radiance(env)
-    size = (radiance.shape[1], radiance.shape[0])
+    image = read_radiance(env)
+    radiance, size, kept = image.rgb, image.size, image.attributes
     try:
         make_mapping("latlong", size)
     except UserError as error:
@@ -570,7 +570,7 @@ def _probe(
     of_scene: Probe | None = None,
 ) -> None:
     from chromeball.envmap.align import read_alignment
-    from chromeball.envmap.mapping import parse_lens
+    from chromeball.envmap.mapping import of_camera, parse_lens
     from chromeball.envmap.picture import read_radiance
     from chromeball.envmap.probe import Shot, combine, world_from_shots
     from chromeball.scene.record import Stage
@@ -581,11 +581,11 @@ def _probe(
     inputs = [*files, *(path for path in (camera, aligned) if path)]
     with Stage("envmap probe", inputs, width=width, vignetting=list(vignetting)) as stage:
         shots: list[Shot] = []
+        clipped: list[float] = []
         kept: dict[str, Any] = {}
         for file, yaw, pitch, roll in zip(files, *angles, strict=True):
-            radiance, valid, attributes = read_radiance(file)
-            kept = kept or attributes
-            size = (radiance.shape[1], radiance.shape[0])
+            image = read_radiance(file)
+            kept, size = kept or dict(image.attributes), image.size
             if lens is not None:
                 model = parse_lens(lens, size)
             elif of_scene is not None:
@@ -594,7 +594,10 @@ def _probe(
                 assert camera is not None
                 model = _read_camera(camera, size, file)
             a, b, c = (math.radians(angle) for angle in (yaw, pitch, roll))
-            shots.append(Shot(radiance, model, a, b, c, valid))
+            shots.append(Shot(image.rgb, model, a, b, c, image.valid))
+            if image.clipped is not None:
+                solid = of_camera(model).solid_angles()
+                clipped.append(float(solid[image.clipped].sum()))
         if aligned is not None:
             pose, picture = read_alignment(aligned)
             index = _clicked_shot(files, clicked, picture, aligned)
@@ -620,6 +623,7 @@ def _probe(
             ],
             "completed_solid_angle": result.missing,
             "completed_share": result.completed_share,
+            "clipped_solid_angle": clipped or None,  # too bright for every exposure: a bound
         }
         _write_panorama(stage, output, result.radiance, result.alpha, kept, origin)
     if result.missing > 0.01:
@@ -644,9 +648,10 @@ def _turn_panorama(
 
     _check_panorama_width(width)
     with Stage("envmap probe", [file, *([aligned] if aligned else [])], width=width) as stage:
-        radiance, valid, kept = read_radiance(file)
+        image = read_radiance(file)
+        kept = dict(image.attributes)
         try:
-            source = make_mapping("latlong", (radiance.shape[1], radiance.shape[0]))
+            source = make_mapping("latlong", image.size)
         except UserError as error:
             raise UserError(error.what, file=file) from error
         origin = kept.get("origin")
@@ -654,7 +659,7 @@ def _turn_panorama(
             pose, _ = read_alignment(aligned)
             source, origin = source.turned(pose.rotation), pose.translation
         target = LatLong((width, width // 2))
-        result = resample(radiance, source, target, valid=valid)
+        result = resample(image.rgb, source, target, valid=image.valid)
         complete(result.radiance, result.coverage == 0)
         stage.figures |= {
             "size": target.size,

@@ -157,6 +157,29 @@ def test_camera_file_and_positions(folder: Path) -> None:
         assert np.linalg.norm(np.array(light["position"]) - PLACE) < 2.5 + 1e-3
 
 
+def test_clipped_and_masked_pixels(tmp_path: Path) -> None:
+    """A lower bound is kept and counted; alpha 0 is left out, NaN or not."""
+    pixels = np.ones((SIZE, SIZE, 5), np.float32)
+    pixels[..., 4] = 0
+    pixels[140:160, 140:160, 4] = 1
+    pixels[:, :100, 3] = 0
+    pixels[:, :100, 0] = np.nan
+    names = ("R", "G", "B", "A", "clipped")
+    write_exr(tmp_path / "s.exr", pixels, channels=names)
+    run(
+        *("envmap", "probe", tmp_path / "s.exr", "--lens", "equisolid:190", "--width", 64),
+        *("-o", tmp_path / "env.exr"),
+    )
+    figures = read_json(tmp_path / "env.exr.record.json")["figures"]
+    solid = of_camera(LENS).solid_angles()
+    assert figures["clipped_solid_angle"] == [pytest.approx(solid[140:160, 140:160].sum())]
+    seen = 4 * math.pi - figures["completed_solid_angle"]
+    assert seen == pytest.approx(solid[:, 100:].sum(), rel=0.01)
+    image = read_image(tmp_path / "env.exr")
+    np.testing.assert_allclose(image.pixels[..., :3], 1, rtol=1e-5)
+    assert "origin" not in image.attributes
+
+
 def test_finished_panorama(tmp_path: Path) -> None:
     """F15: clicks in somebody's lat-long, then the map turned into the world's axes."""
     pose = Pose(
