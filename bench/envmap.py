@@ -50,6 +50,8 @@ def rows(quick: bool) -> list[Row]:
 
 
 def _task(what: str, source: Mapping, target: Mapping) -> list[Row]:
+    import cv2
+
     world, kind = _world()
     picture, truth = _average(world, source), _average(world, target)
     solid = target.solid_angles()
@@ -58,6 +60,7 @@ def _task(what: str, source: Mapping, target: Mapping) -> list[Row]:
     inner = (solid > 0.5 * np.median(solid[solid > 0])) & np.isfinite(d).all(axis=2)
     seen = source.project(np.nan_to_num(d) @ source.rotation)
     inner &= np.isfinite(seen).all(axis=2)
+    inner = np.asarray(cv2.erode(inner.astype(np.uint8), np.ones((3, 3), np.uint8))) > 0
     suns = _with_suns(source)
     energy_of_suns = np.einsum("hwc,hw->", suns.astype(float), source.solid_angles())
     found: list[Row] = []
