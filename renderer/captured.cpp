@@ -5,25 +5,29 @@
 
 namespace chromeball {
 
-Captured::Captured(const StandIn& stand_in, const Environment& environment, Vec3 origin)
+Captured::Captured(const StandIn& stand_in, const Environment& environment, Vec3 origin,
+                   uint64_t seed)
     : stand_in_(stand_in), environment_(environment), origin_(origin) {
-  if (!stand_in.size()) {
-    accel_.commit();
-    return;
-  }
+  if (stand_in.size()) find_planes();
+  accel_.commit();
+  if (environment.even()) return;
+  lights_.resize(kLights);
+  for (uint32_t k = 0; k < kLights; ++k) lights_[k] = draw(k, seed);
+}
+
+void Captured::find_planes() {
+  const StandIn& stand_in = stand_in_;
   const size_t v = stand_in.vertices.size() / 3;
   accel_.add(stand_in.vertices.data(), v, stand_in.faces.data(), stand_in.size());
-  accel_.commit();
-
   Accel original;  // the set as it was when the map was captured
   original.add(stand_in.original.data(), v, stand_in.faces.data(), stand_in.size());
   original.commit();
-  const uint32_t texels = uint32_t(environment.height()) * environment.width();
+  const uint32_t texels = uint32_t(environment_.height()) * environment_.width();
   planes_.resize(texels);
   tbb::parallel_for(tbb::blocked_range<uint32_t>(0, texels, 4096), [&](const auto& range) {
     const FlushDenormals flush;
     for (uint32_t t = range.begin(); t < range.end(); ++t) {
-      const Hit hit = original.intersect(origin, environment.texel_direction(t));
+      const Hit hit = original.intersect(origin_, environment_.texel_direction(t));
       if (!hit) continue;
       bool moved = false;
       for (int k = 0; k < 3; ++k) {
@@ -67,19 +71,30 @@ float Captured::jacobian(Vec3 x, Vec3 q, Vec3 n) const {
   return cos_x > 1e-6f ? cos_o * x2 / (o2 * cos_x) : 0;
 }
 
-Captured::Sample Captured::sample(Vec3 x, Pair u) const {
-  if (environment_.even()) return {};
-  const Environment::Sample s = environment_.sample(u.bits, u.y);
-  if (planes_.empty()) return {s.direction, kInfinity, s.density};
+Captured::Light Captured::draw(uint32_t k, uint64_t seed) const {
+  const uint64_t h = mix64(seed + k);
+  const uint32_t stratum = uint32_t((uint64_t(1) << 32) / kLights);
+  const uint32_t bits = k * stratum + uint32_t(h) % stratum;
+  const Environment::Sample s = environment_.sample(bits, float(h >> 40) * 0x1p-24f);
+  if (planes_.empty()) return {s.direction, false, {}, s.density};
   const Plane& plane = planes_[s.texel];
-  if (is_zero(plane.n)) return {s.direction, kInfinity, s.density};
+  if (is_zero(plane.n)) return {s.direction, false, {}, s.density};
   // q = o + z w, the light's place
-  const float z = (plane.offset - dot(plane.n, origin_)) / dot(plane.n, s.direction);
+  const float cos = dot(plane.n, s.direction);
+  const float z = (plane.offset - dot(plane.n, origin_)) / cos;
   if (!(z > 0 && z < kInfinity)) return {};
-  const Vec3 q = origin_ + z * s.direction, to = q - x;
-  const float t = length(to);
-  if (!(t > 1e-5f)) return {};
-  return {to * (1 / t), t, s.density * jacobian(x, q, plane.n)};
+  return {origin_ + z * s.direction, true, plane.n, s.density * std::abs(cos) / (z * z)};
+}
+
+Captured::Sample Captured::sample(Vec3 x, Pair u) const {
+  if (lights_.empty()) return {};
+  const Light& light = lights_[(uint64_t(u.bits) * kLights) >> 32];
+  if (!light.finite) return {light.place, kInfinity, light.density};
+  const Vec3 to = light.place - x;
+  const float x2 = length2(to), t = std::sqrt(x2);
+  const float cos_x = std::abs(dot(to, light.n)) / t;
+  if (!(t > 1e-5f && cos_x > 1e-6f)) return {};
+  return {to * (1 / t), t, light.density * x2 / cos_x};
 }
 
 float Captured::density(Vec3 x, Vec3 d, const Place& place) const {

@@ -37,7 +37,7 @@ struct Place {
 
 class Captured {
  public:
-  Captured(const StandIn& stand_in, const Environment& environment, Vec3 origin);
+  Captured(const StandIn& stand_in, const Environment& environment, Vec3 origin, uint64_t seed);
 
   Place trace(Vec3 o, Vec3 d, float tfar = kInfinity) const;
   bool blocked(Vec3 o, Vec3 d, float tfar) const { return accel_.occluded(o, d, tfar); }
@@ -47,7 +47,8 @@ class Captured {
   // L_cap: the radiance that the map holds for a place, or for a direction to infinity.
   Vec3 radiance(const Place& place, Vec3 d) const;
 
-  // Importance sampling of the light seen from x.
+  // Importance sampling of the light seen from x: one of the list of lights that was drawn from
+  // the map beforehand, so that a sample costs one place in the cache and not five in the map.
   struct Sample {
     Vec3 d;
     float t = 0;        // distance of the light, infinite for a direction, 0: no light
@@ -70,6 +71,17 @@ class Captured {
     Vec3 n;
     float offset = 0;
   };
+  // A point of the map, drawn with its density and stratified along the map's Hilbert curve.
+  struct Light {
+    Vec3 place;         // metres; a direction for the infinite environment
+    bool finite;
+    Vec3 n;             // of the surface that shows the light
+    float density = 0;  // 1/sr at the origin, times cos_o / o^2 for a finite light; 0: no light
+  };
+  static constexpr uint32_t kLights = 8192;
+  void find_planes();
+  Light draw(uint32_t k, uint64_t seed) const;
+
   // d omega_o / d omega_x through the surface element at q with normal n.
   float jacobian(Vec3 x, Vec3 q, Vec3 n) const;
 
@@ -78,6 +90,7 @@ class Captured {
   Vec3 origin_;
   Accel accel_;
   std::vector<Plane> planes_;
+  std::vector<Light> lights_;
 };
 
 }  // namespace chromeball

@@ -79,7 +79,7 @@ Compositor::Compositor(const Mesh& objects, std::vector<Sphere> bounds, const St
                        uint32_t expected_samples)
     : objects_(objects),
       bounds_(std::move(bounds)),
-      captured_(stand_in, environment, origin),
+      captured_(stand_in, environment, origin, seed),
       irradiance_(captured_, seed),
       table_(expected_samples, seed),
       bounces_(bounces),
@@ -233,7 +233,7 @@ Vec3 Compositor::relative_change(const Place& place, int bounces, bool both, Pat
 }
 
 uint64_t Compositor::pass(const PixelRays& rays, Vec3 camera, const float* plate,
-                          bool difference, uint32_t first, uint32_t count, float* film) const {
+                          bool difference, const uint16_t* counts, float* film) const {
   std::atomic<uint64_t> traced{0};
   const tbb::blocked_range2d<int> tiles(0, rays.height, 8, 0, rays.width, 8);
   tbb::parallel_for(tiles, [&](const auto& tile) {
@@ -245,7 +245,9 @@ uint64_t Compositor::pass(const PixelRays& rays, Vec3 camera, const float* plate
         const size_t pixel = size_t(y) * rays.width + x;
         float* to = film + Film::kCount * pixel;
         const Vec3 B(plate + 3 * pixel);
-        for (uint32_t i = first; i < first + count; ++i) {
+        const uint32_t first = uint32_t(to[Film::kSamples]);
+        to[Film::kSamples] += counts[pixel];
+        for (uint32_t i = first; i < first + counts[pixel]; ++i) {
           Sampler sampler(table_, seed_ + pixel, i);
           Path path{sampler};
           const Pair u = sampler.pair();

@@ -28,7 +28,8 @@ struct Film {
     kSurfaces = 12,  // 1: sub-samples that meet any surface
     kSquare = 13,    // 1: square of the brightness, for the standard error
     kBrightness = 14,// 1
-    kCount = 15,
+    kSamples = 15,   // 1: sub-samples so far
+    kCount = 16,
   };
 };
 
@@ -39,10 +40,10 @@ class Compositor {
              const Environment& environment, Vec3 origin, int bounces, uint64_t seed,
              uint32_t expected_samples);
 
-  // Adds sub-samples first .. first + count - 1 of each pixel to film (H, W, Film::kCount).
+  // Adds the next counts (H, W) sub-samples of each pixel to film (H, W, Film::kCount).
   // `plate` (H, W, 3) is only used to know how bright a change is. Returns rays traced.
   uint64_t pass(const PixelRays& rays, Vec3 camera, const float* plate, bool difference,
-                uint32_t first, uint32_t count, float* film) const;
+                const uint16_t* counts, float* film) const;
 
   // The captured set alone through the camera, mean of `count` sub-samples: a plate.
   void background(const PixelRays& rays, Vec3 camera, uint32_t count, float* radiance) const;

@@ -18,6 +18,7 @@ using In4f = nb::ndarray<const float, nb::shape<-1, 4>, nb::c_contig, nb::device
 using In1f = nb::ndarray<const float, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
 using In1b = nb::ndarray<const uint8_t, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
 using Picture = nb::ndarray<const float, nb::shape<-1, -1, 3>, nb::c_contig, nb::device::cpu>;
+using Counts = nb::ndarray<const uint16_t, nb::shape<-1, -1>, nb::c_contig, nb::device::cpu>;
 using InOut = nb::ndarray<float, nb::shape<-1, -1, Film::kCount>, nb::c_contig, nb::device::cpu>;
 using Out = nb::ndarray<nb::numpy, float, nb::ndim<3>>;
 
@@ -180,20 +181,21 @@ NB_MODULE(core, m) {
       .def(
           "add",
           [](const CompositorArrays& self, Picture corners, std::array<float, 3> camera,
-             Picture plate, bool difference, uint32_t first, uint32_t count, InOut film) {
+             Picture plate, bool difference, Counts counts, InOut film) {
             const PixelRays rays = pixel_rays(corners);
             for (const auto& a : {std::pair(plate.shape(0), plate.shape(1)),
+                                  std::pair(counts.shape(0), counts.shape(1)),
                                   std::pair(film.shape(0), film.shape(1))}) {
               if (int(a.first) != rays.height || int(a.second) != rays.width) {
-                throw nb::value_error("rays, plate and film differ in size");
+                throw nb::value_error("rays, plate, counts and film differ in size");
               }
             }
             nb::gil_scoped_release release;
-            return self->pass(rays, Vec3(camera.data()), plate.data(), difference, first, count,
+            return self->pass(rays, Vec3(camera.data()), plate.data(), difference, counts.data(),
                               film.data());
           },
           nb::arg("corners"), nb::arg("camera"), nb::arg("plate"), nb::arg("difference"),
-          nb::arg("first"), nb::arg("count"), nb::arg("film"))
+          nb::arg("counts"), nb::arg("film"))
       .def(
           "background",
           [](const CompositorArrays& self, Picture corners, std::array<float, 3> camera,

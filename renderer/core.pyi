@@ -1,4 +1,4 @@
-from numpy import float32, uint8, uint32
+from numpy import float32, uint8, uint16, uint32
 from numpy.typing import NDArray
 
 class Mesh:
@@ -60,8 +60,7 @@ class Compositor:
         camera: tuple[float, float, float],
         plate: NDArray[float32],
         difference: bool,
-        first: int,
-        count: int,
+        counts: NDArray[uint16],
         film: NDArray[float32],
     ) -> int: ...
     def background(

@@ -31,7 +31,7 @@ Irradiance::Irradiance(const Captured& captured, uint64_t seed)
     most = {std::max(most.x, p.x), std::max(most.y, p.y), std::max(most.z, p.z)};
   }
   // many small planes (a scanned surface) need no lattice as fine as one large floor
-  const float finest = members.empty() ? 0 : length(most - least) / (4 * kCells);
+  const float finest = members.empty() ? 0 : length(most - least) / (2 * kCells);
   for (size_t g = 0; g < members.size(); ++g) {
     const Frame frame(normals_[g]);
     float low[2] = {kInfinity, kInfinity}, high[2] = {-kInfinity, -kInfinity};

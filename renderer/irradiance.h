@@ -20,7 +20,7 @@ class Irradiance {
   Vec3 solve(Vec3 p, Vec3 n) const;
 
  private:
-  static constexpr uint32_t kSamples = 512;  // of each of the two strategies
+  static constexpr uint32_t kSamples = 256;  // of each of the two strategies
   static constexpr int kCells = 80;          // along the diagonal of a plane
 
   struct Node {

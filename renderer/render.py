@@ -151,7 +151,7 @@ def accumulate(
     start = time.perf_counter()
     while True:
         left = _PASS if budget.spp is None else min(_PASS, budget.spp - compositor.samples)
-        compositor.add(left)
+        compositor.refine(left)
         seconds = time.perf_counter() - start
         if progress is not None:
             progress(compositor.samples, seconds)

@@ -224,7 +224,7 @@ class Render(Table, frozen=True):
 
     spp: Annotated[int, Meta(ge=1)] = 64
     seed: int = 0
-    bounces: Annotated[int, Meta(ge=0)] = 4
+    bounces: Annotated[int, Meta(ge=0)] = 2
     composite: Literal["quotient", "difference"] = "quotient"
 
 
