@@ -46,7 +46,9 @@ Irradiance::Irradiance(const Captured& captured, uint64_t seed)
       }
     }
     const float a = high[0] - low[0], b = high[1] - low[1];
-    const float step = std::max({std::hypot(a, b) / kCells, finest, 1e-6f});
+    // over one plane and nothing else the light is infinitely far, the irradiance even
+    const int cells = members[g].size() == stand_in.size() ? 1 : kCells;
+    const float step = std::max({std::hypot(a, b) / cells, finest, 1e-6f});
     const float offset = dot(stand_in.corner(members[g][0], 0), frame.n);
     for (const float side : {1.0f, -1.0f}) {
       Lattice lattice;
