@@ -94,7 +94,7 @@ def make(folder: Path) -> None:
     # flags of a make that we run under are not meant for this one
     without = ("MAKEFLAGS", "MAKELEVEL", "MFLAGS")
     environment = {k: v for k, v in os.environ.items() if k not in without} | {"PATH": path}
-    command = ["make", "--no-print-directory", "-C", str(folder)]
+    command = ["make", "--no-print-directory", "-j2", "-C", str(folder)]
     try:
         result = subprocess.run(command, env=environment, stdout=sys.stderr, check=False)
     except FileNotFoundError as error:

@@ -60,7 +60,7 @@ class Bracket(Table, frozen=True):
 class Hdr(Table, frozen=True):
     """Response and merge. ``response``: a stored curve; else it is solved from ``solve_from``.
 
-    ``smoothness`` is Debevec and Malik's lambda. ``refine_times``: the times of the metadata are
+    ``smoothness`` is Debevec and Malik's lambda. ``refine_times``: the metadata's times are
     nominal; solve them too, the span from shortest to longest fixed.
     """
 
