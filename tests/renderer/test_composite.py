@@ -314,3 +314,47 @@ def test_a_stand_in_that_was_moved_keeps_its_light() -> None:
     bright = np.argwhere(job.plate[..., 0] > 2).mean(axis=0)[::-1]
     expected = view.project_world(np.array([0.0, 3.0, 4.0]))
     np.testing.assert_allclose(bright, expected, atol=1.0)
+
+
+def test_refined_samples_are_as_many_and_change_no_mean() -> None:
+    view = camera((0, 2, 4), (0, 0.3, 0), 0.9, (64, 48))
+    thing = [ball((0, 0.5, 0), 0.5, 0.5, Kind.DIFFUSE)]
+    sky = np.full((32, 64, 3), 0.2, np.float32)
+    sky[6:9, 40:44] = 20.0
+    even = compositor(thing, sky, floor(), view, samples=256)
+    even.add(512)
+    steered = compositor(thing, sky, floor(), view, samples=256, seed=5)
+    for _ in range(8):
+        steered.refine(16)
+    assert steered.samples == 128
+    a, b = even.result(), steered.result()
+    # each region's mean agrees within what its standard errors allow, at 4 sigma
+    for region in (a.alpha == 1, a.changed & (a.alpha == 0)):
+        count = region.sum()
+        error = np.hypot(
+            np.sqrt((a.standard_error[region] ** 2).sum()),
+            np.sqrt((b.standard_error[region] ** 2).sum()),
+        )
+        difference = (b.rgb[region] - a.rgb[region]).mean(axis=1).sum()
+        assert count > 100
+        assert abs(difference) < 4 * error + 1e-4 * a.rgb[region].mean(axis=1).sum()
+
+
+def test_refining_gives_less_noise_than_even_samples_of_the_same_number() -> None:
+    view = camera((0, 2, 6), (0, 0.3, 0), 0.9, (64, 48))
+    thing = [ball((0, 0.5, 0), 0.5, 0.5, Kind.DIFFUSE)]
+    even = compositor(thing, WHITE, floor(), view, samples=64)
+    even.add(64)
+    steered = compositor(thing, WHITE, floor(), view, samples=64)
+    for _ in range(8):
+        steered.refine(8)
+    assert steered.samples == even.samples
+    assert steered.result().relative_error() < 0.8 * even.result().relative_error()
+
+
+def test_refining_without_objects_leaves_the_plate() -> None:
+    plate = noise_plate()
+    job = compositor([], WHITE, floor(), camera((0, 1, 2), (0, 0, 0), 0.6), plate=plate)
+    for _ in range(3):
+        job.refine(8)
+    assert job.result().rgb.tobytes() == plate.tobytes()
