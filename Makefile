@@ -9,7 +9,7 @@ RUN := .venv/bin/
 READY := .venv/.ready
 SOURCES := pyproject.toml CMakeLists.txt .python-version \
   $(wildcard */CMakeLists.txt */*.cpp */*.h */*/*.cpp */*/*.h)
-DATA ?= ../shared/data/hdr/fisheye_lumilab
+DATA ?=
 
 .PHONY: help setup demo office test lint bench clean
 
@@ -51,7 +51,7 @@ $(READY): $(SOURCES) | .venv/.system $(filter .tools/bin/uv,$(UV))
 	  if $$p -c 'import sys; sys.exit(sys.version_info[:2] != (3, 13))' 2>/dev/null; then python=$$p; break; fi; \
 	done; \
 	[ -x .venv/bin/python ] || { $(UV) venv --quiet --allow-existing --python $$python .venv; }
-	$(UV) sync --quiet --only-group build
+	$(UV) sync --quiet --inexact --only-group build
 	$(UV) sync --quiet --all-extras
 	@touch $@
 
@@ -59,6 +59,7 @@ demo: $(READY)
 	@$(RUN)chromeball demo
 
 office: $(READY)
+	@[ -n "$(DATA)" ] || { echo 'make office DATA=folder: the folder that holds JPEG/*.JPG'; exit 2; }
 	@$(RUN)chromeball new office --example office --set data="$(DATA)" --if-absent
 	@PATH="$(CURDIR)/.venv/bin:$$PATH" $(MAKE) --no-print-directory -C office
 

@@ -17,7 +17,7 @@ from chromeball.calibrate.target import Charuco, Chessboard
 from chromeball.calibrate.virtual import board_poses, photograph, project
 from chromeball.scene.camera import CameraModel
 
-DATA = Path(__file__).parents[1].parent / "shared/data/calibrate/opencv_stereo"
+DATA = Path(__file__).resolve().parents[1].parent / "shared/data/calibrate/opencv_stereo"
 BOARD = Chessboard(9, 6, 0.025)
 FOLDS = 4
 

@@ -26,7 +26,9 @@ from chromeball.scene.image import read_image
 type Picture = NDArray[np.float32]
 type Tool = Callable[[Picture, Mapping, Mapping], Picture]
 
-DATA = Path(__file__).parents[1].parent / "shared/data/envmap/latlong1k/quarry_01_1k.hdr"
+DATA = (
+    Path(__file__).resolve().parents[1].parent / "shared/data/envmap/latlong1k/quarry_01_1k.hdr"
+)
 SUNS = 8
 
 

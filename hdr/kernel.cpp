@@ -84,7 +84,7 @@ nb::object patches(nb::ndarray<const std::uint8_t, nb::ndim<3>, nb::c_contig, nb
           const std::uint32_t n = static_cast<std::uint32_t>(size * size);
           const bool usable = low > 0 && high < 255 && high - low <= spread;
           mean[(row * columns + column) * C + c] =
-              usable ? static_cast<std::uint16_t>((sum * 256 + n / 2) / n) : unusable;
+              usable ? static_cast<std::uint16_t>((std::uint64_t{sum} * 256 + n / 2) / n) : unusable;
         }
     });
   }

@@ -114,6 +114,8 @@ def merge_linear(
         raise UserError(f"linear pictures of {kind} values: 16-bit or float ones are needed")
     if white is None:
         white = 65535.0 if kind == np.uint16 else max(float(f.max()) for f in frames)
+    if kind == np.uint16 and white > 65535:
+        raise UserError(f"16-bit pictures hold no white of {white:g}; it is at most 65535")
     if not (np.isfinite(white) and white > 0):
         raise UserError("all pictures are black: take longer exposures")
     if not (noise[0] >= 0 and noise[1] > 0 and np.all(np.isfinite(noise))):

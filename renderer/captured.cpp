@@ -60,7 +60,8 @@ Place Captured::trace(Vec3 o, Vec3 d, float tfar) const {
 
 Vec3 Captured::radiance(const Place& place, Vec3 d) const {
   if (!place) return environment_.radiance(d);
-  return environment_.radiance(normalize(place.captured_at - origin_));
+  const Vec3 w = place.captured_at - origin_;
+  return is_zero(w) ? Vec3() : environment_.radiance(normalize(w));  // the probe's own place
 }
 
 float Captured::jacobian(Vec3 x, Vec3 q, Vec3 n) const {

@@ -142,6 +142,9 @@ class Compositor:
         height, width = self._rays.shape[0] - 1, self._rays.shape[1] - 1
         if self.plate.shape != (height, width, 3):
             raise ValueError(f"plate is {self.plate.shape}, rays are for {height} x {width}")
+        corners = np.isfinite(self._rays).all(axis=2)
+        #: pixels inside the lens; the core leaves the others out
+        self._seen = corners[1:, 1:] & corners[1:, :-1] & corners[:-1, 1:] & corners[:-1, :-1]
         self._film = np.zeros((height, width, _COUNT), np.float32)
         #: samples a pixel so far (the mean where they differ), rays traced so far
         self.samples, self.rays_traced = 0, 0
@@ -160,14 +163,14 @@ class Compositor:
         samples have not met yet may still be there.
         """
         n = self._film[..., _SAMPLES]
-        if float(n.min()) < _PILOT:
+        if not self._seen.any() or float(n[self._seen].min()) < _PILOT:
             self.add(samples)
             return
         sigma = _neighbourhood(self._relative_deviation())
-        mean = float(sigma.mean())
+        mean = float(sigma[self._seen].mean())
         share = 0.25 + 0.75 * sigma / mean if mean > 0 else np.ones_like(sigma)
-        wanted = np.maximum(share * (self.samples + samples) - n, 0)
-        counts = wanted * (samples * wanted.size / max(float(wanted.sum()), 1.0))
+        wanted = np.maximum(share * (self.samples + samples) - n, 0) * self._seen
+        counts = wanted * (samples * float(self._seen.sum()) / max(float(wanted.sum()), 1.0))
         # rounded so that fractions add up along the rows
         rows = np.cumsum(counts, axis=1)
         whole = np.diff(np.floor(rows), axis=1, prepend=0.0)

@@ -195,7 +195,7 @@ NB_MODULE(core, m) {
                               film.data());
           },
           nb::arg("corners"), nb::arg("camera"), nb::arg("plate"), nb::arg("difference"),
-          nb::arg("counts"), nb::arg("film"))
+          nb::arg("counts"), nb::arg("film").noconvert())
       .def(
           "background",
           [](const CompositorArrays& self, Picture corners, std::array<float, 3> camera,

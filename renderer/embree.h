@@ -127,9 +127,9 @@ class Accel {
     void operator()(RTCDevice d) const { rtcReleaseDevice(d); }
     void operator()(RTCScene s) const { rtcReleaseScene(s); }
   };
+  std::string error_;  // first, so that it outlives the device that reports into it
   std::unique_ptr<RTCDeviceTy, Release> device_;
   std::unique_ptr<RTCSceneTy, Release> scene_;
-  std::string error_;
   bool empty_ = true;
 };
 

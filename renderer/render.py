@@ -89,7 +89,9 @@ def prepare(scene: Scene, folder: Path, view: View, spp: int) -> Job:
     plate = None
     if view.bracket or view.plate:
         plate_file = build / f"{view.bracket}.exr" if view.bracket else folder / str(view.plate)
-        camera_file = build / f"{view.name}.cameramodel"
+        # posed by four points, or a file that holds the pose
+        solved = view.points or not view.camera
+        camera_file = build / f"{view.name}.cameramodel" if solved else folder / view.camera
         inputs += [plate_file, camera_file]
         plate = read_rgb(plate_file)
         camera = CameraModel.read(camera_file)

@@ -88,6 +88,11 @@ class StandInMesh:
             )
         if (bad := (faces == np.roll(faces, 1, axis=1)).any(axis=1)).any():
             raise UserError(f"face {int(bad.argmax())} names a vertex twice")
+        a, b, c = np.moveaxis(self.vertices[faces].astype(float), 1, 0)
+        area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+        longest = np.maximum(np.linalg.norm(b - a, axis=1), np.linalg.norm(c - a, axis=1))
+        if (bad := area <= 1e-7 * longest**2).any():
+            raise UserError(f"face {int(bad.argmax())} has no area: its corners lie on a line")
         if (bad := self.surface > ENVIRONMENT).any():
             raise UserError(
                 f"face {int(bad.argmax())} has surface {int(self.surface[bad][0])}; "

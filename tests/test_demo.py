@@ -79,8 +79,8 @@ def test_pixels_far_from_the_objects_keep_their_bits(demo: tuple[Path, str]) -> 
     plate = read_rgb(folder / "build/plate.exr")
     same = (composite == plate).all(axis=2)
     changed = read_image(folder / "truth/changed.png").pixels[..., 0] > 127
-    assert same[:60].all()
-    assert not same[changed].all()
+    assert same[:50].all()  # walls, which are no support
+    assert same[changed].mean() < 0.01
     assert same.mean() > 0.2
 
 
@@ -121,6 +121,7 @@ def test_a_changed_material_renders_again_and_nothing_else(demo: tuple[Path, str
 
 def test_nothing_but_the_report_reads_the_truth(demo: tuple[Path, str]) -> None:
     folder, _ = demo
+    assert "truth" not in (folder / "pipeline.mk").read_text()
     for record in sorted((folder / "build").glob("*.record.json")):
         read = json.loads(record.read_text())
         if read["stage"] in ("truth", "report"):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import sys
-from fractions import Fraction
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -30,13 +29,9 @@ def parse_times(text: str | None) -> list[float] | None:
     """``1/30,0.5,13`` -> seconds."""
     if text is None:
         return None
-    try:
-        times = [float(Fraction(part.strip())) for part in text.split(",")]
-    except (ValueError, ZeroDivisionError) as error:
-        raise UserError(f"--times {text}: write seconds as 1/30,1/60,0.5") from error
-    if any(time <= 0 for time in times):
-        raise UserError(f"--times {text}: exposure times are positive")
-    return times
+    from chromeball.scene.manifest import parse_time
+
+    return [parse_time(part.strip()) for part in text.split(",")]
 
 
 @app.command

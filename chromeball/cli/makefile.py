@@ -59,21 +59,21 @@ def write_pipeline(plan: Sequence[StagePlan], scene: Scene, path: Path) -> Path:
 
 
 def _rule(stage: StagePlan, folder: str) -> str:
-    targets = " ".join(map(_target, stage.outputs))
-    # one run makes all outputs: grouped targets, so that -j does not run it twice
-    colon = ":" if len(stage.outputs) == 1 else " &:"
+    # One run makes all outputs. The others follow from the first and are only made by
+    # themselves where they were deleted; with grouped targets make -n (4.3) forgets what
+    # depends on them.
+    target, *others = map(_target, stage.outputs)
     needs = [*stage.inputs, stage.slice_file(folder)]
     after = ["|", *map(_name, stage.after)] if stage.after else []
     command = shlex.join(stage.command)
     if re.search(r"[\x00-\x1f\x7f]", command):
         raise UserError(f"{stage.name}: a value holds a control character; rename the file")
-    return (
-        _comment(f"{stage.name}: {stage.reason}")
-        + "\n"
-        + _wrap(targets + colon, [*map(_name, needs), *after])
-        + "\n\t"
-        + command.replace("$", "$$")
-    )
+    recipe = command.replace("$", "$$")
+    rules = [
+        _wrap(f"{target}:", [*map(_name, needs), *after]) + f"\n\t{recipe}",
+        *(f"{other}: {target}\n\t@[ -e '$@' ] || {recipe}" for other in others),
+    ]
+    return "\n".join([_comment(f"{stage.name}: {stage.reason}"), *rules])
 
 
 def _comment(text: str) -> str:

@@ -113,9 +113,10 @@ class _Planner:
             plan.append(self._take(bracket, plan))
         plan.append(self._response())
         plan += [self._merge(bracket) for bracket in scene.bracket]
-        plan += [self._lens(), self._align(), self._probe(), self._lights()]
+        plan += [self._lens(), self._align(), self._probe()]
         plan += [self._pose(view) for view in scene.view]
         plan += self._stand_in()
+        plan.append(self._lights())
         plan += [self._render(view) for view in scene.view]
         plan.append(self._report(plan))
         return plan
@@ -481,13 +482,18 @@ class _Planner:
             return StagePlan(name, False, "no environment map")
         output = f"{self.build}/lights.json"
         count = str(self.scene.env.lights)
+        depth = (f"{self.build}/env_depth.exr",) if self.scene.stand_in else ()
         return StagePlan(
             name,
             True,
             "a by-product for other renderers; ours samples the map itself",
-            (self._env(),),
+            (self._env(), *depth),
             (output,),
-            ("chromeball", "envmap", "lights", self._env(), "--count", count, "-o", output),
+            (
+                *("chromeball", "envmap", "lights", self._env(), "--count", count),
+                *(option for path in depth for option in ("--depth", path)),
+                *("-o", output),
+            ),
             {},
         )
 
@@ -540,7 +546,7 @@ class _Planner:
         yield StagePlan(
             names[1],
             True,
-            "how far away the light comes from",
+            "how far away the light comes from; the lights get places",
             (mesh, env),
             (depth,),
             ("chromeball", "stand-in", "depth", mesh, "--env", env, "-o", depth),
@@ -554,7 +560,7 @@ class _Planner:
             return StagePlan(name, False, "no [[object]]")
         inputs = [self._env()]
         if scene.stand_in:
-            inputs += [f"{self.build}/stand_in.ply", f"{self.build}/env_depth.exr"]
+            inputs.append(f"{self.build}/stand_in.ply")
         if view.bracket:
             inputs.append(f"{self.build}/{view.bracket}.exr")
         if view.plate:

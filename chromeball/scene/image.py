@@ -21,6 +21,8 @@ from chromeball.scene.record import atomic_output
 RAW_SUFFIXES = frozenset(
     {".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw"}
 )
+#: 16-bit sensor values from here on are saturated.
+_RAW_SATURATED = 64880
 LINEAR_SUFFIXES = frozenset({".exr", ".hdr", ".pfm"}) | RAW_SUFFIXES
 
 
@@ -297,14 +299,15 @@ def _read_raw(path: Path) -> Image:
     import rawpy
 
     with _open_raw(path) as raw:
+        linear: dict[str, Any] = {"gamma": (1, 1), "no_auto_bright": True, "output_bps": 16}
         pixels = raw.postprocess(
-            gamma=(1, 1),
-            no_auto_bright=True,
-            output_bps=16,
-            use_camera_wb=True,
-            output_color=rawpy.ColorSpace.sRGB,
-            user_flip=0,
+            use_camera_wb=True, output_color=rawpy.ColorSpace.sRGB, user_flip=0, **linear
         )
+        # the sensor's own channels say what is saturated; the colour matrix would hide it
+        sensor = raw.postprocess(
+            user_wb=[1, 1, 1, 1], output_color=rawpy.ColorSpace.raw, user_flip=0, **linear
+        )
+        pixels[(sensor >= _RAW_SATURATED).any(axis=2)] = 65535
         exposure = _raw_exposure(raw, path)
     return Image(pixels=pixels, linear=True, channels=("R", "G", "B"), exposure=exposure)
 

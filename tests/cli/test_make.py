@@ -89,7 +89,8 @@ def test_a_comment_reruns_nothing(made: Workshop) -> None:
 def test_changed_times_retake_and_all_that_follows(made: Workshop) -> None:
     edit(made, "yaw = -180 }]", "yaw = -170 }]")
     ran = made.run()
-    assert ran[:3] == ["plan", "envmap probe build/front.exr", "envmap lights build/env.exr"]
+    assert ran[:2] == ["plan", "envmap probe build/front.exr"]
+    assert "envmap lights build/env.exr" in ran
     assert "hdr merge takes/front" not in ran
     assert "stand-in build scene.toml" in ran
 
