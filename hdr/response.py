@@ -140,7 +140,8 @@ def solve(
     share = kernel.shares(codes, w**2)
     H, observed, used = kernel.accumulate(codes, w**2, share)
     _refuse_few(samples, used, observed)
-    s = np.sum(w**2) / np.trace(H[:, :CODES, :CODES], axis1=1, axis2=2)
+    observed_weight = np.trace(H[:, :CODES, :CODES], axis1=1, axis2=2)
+    s = np.sum(w**2) / np.where(observed_weight > 0, observed_weight, np.inf)
 
     D = second_difference(w)
 

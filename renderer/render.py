@@ -21,7 +21,7 @@ from chromeball.scene.errors import UserError
 from chromeball.scene.image import read_image, read_rgb, to_display, write_exr, write_picture
 from chromeball.scene.manifest import Scene, View
 from chromeball.scene.pose import Pose
-from chromeball.scene.record import Stage
+from chromeball.scene.record import Stage, check_output
 from chromeball.stand_in.ply import read_stand_in
 
 #: Samples of one progressive pass.
@@ -90,8 +90,9 @@ def prepare(scene: Scene, folder: Path, view: View, spp: int) -> Job:
     if view.bracket or view.plate:
         plate_file = build / f"{view.bracket}.exr" if view.bracket else folder / str(view.plate)
         # posed by four points, or a file that holds the pose
-        solved = view.points or not view.camera
-        camera_file = build / f"{view.name}.cameramodel" if solved else folder / view.camera
+        camera_file = build / f"{view.name}.cameramodel"
+        if view.camera and not view.points:
+            camera_file = folder / view.camera
         inputs += [plate_file, camera_file]
         plate = read_rgb(plate_file)
         camera = CameraModel.read(camera_file)
@@ -136,6 +137,10 @@ def virtual_camera(view: View, origin: NDArray[np.float64]) -> CameraModel:
         raise UserError(
             f"view {view.name!r}: look_at is the place of the light probe; choose another point"
         ) from error
+    if np.linalg.norm(target - origin) < 1e-4:
+        raise UserError(
+            f"view {view.name!r}: look_at is the place of the light probe; choose another point"
+        )
     fov = math.radians(view.fov)
     if view.model == "pinhole":
         if fov >= math.radians(179):
@@ -151,8 +156,12 @@ def accumulate(
 ) -> Composite:
     """Passes until the budget is reached; `progress` gets samples and seconds so far."""
     start = time.perf_counter()
+    seconds = 0.0
     while True:
         left = _PASS if budget.spp is None else min(_PASS, budget.spp - compositor.samples)
+        if budget.seconds is not None:  # as many as still fit, by the speed so far
+            speed = compositor.samples / seconds if seconds > 0 else 0.0
+            left = max(1, min(left, int(speed * (budget.seconds - seconds))))
         compositor.refine(left)
         seconds = time.perf_counter() - start
         if progress is not None:
@@ -180,6 +189,8 @@ def render_view(
     target = Path(output) if output else folder / scene.folder / f"{view.name}.exr"
     if target.suffix.lower() != ".exr":
         raise UserError("the composite is an EXR file; name it so", file=target)
+    for file in (target, target.with_suffix(".png")):
+        check_output(file)
     if budget == Budget():
         budget = replace(budget, spp=scene.render.spp)
     spp = budget.spp if budget.spp is not None and budget.spp < 4096 else 256
@@ -200,8 +211,11 @@ def render_view(
             "spp": job.compositor.samples,
             "seconds": seconds,
             "mrays_per_second": job.compositor.rays_traced / max(seconds, 1e-9) / 1e6,
+            # one sample says nothing of its noise
+            "relative_error": composite.relative_error()
+            if job.compositor.samples > 1
+            else None,
             "median_standard_error": float(np.median(relative)) if relative.size else 0.0,
-            "relative_error": composite.relative_error(),
             "changed_pixels": int(changed.sum()),
             "coverage": float(composite.alpha.mean()),
             "clipped_negative_pixels": composite.clipped,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,9 @@ from chromeball.renderer.primitives import PRIMITIVES, Triangles
 from chromeball.scene.errors import UserError
 from chromeball.scene.manifest import Object, Scene
 from chromeball.scene.pose import Pose
+
+#: What MeshLab reads without crashing on broken files (its FBX importer does).
+MESH_SUFFIXES = frozenset({".ply", ".obj", ".stl", ".off", ".gltf", ".glb", ".dae", ".3ds"})
 
 
 def object_meshes(scene: Scene, folder: str | os.PathLike[str] = ".") -> list[Mesh]:
@@ -70,6 +74,10 @@ def read_mesh(path: str | os.PathLike[str]) -> Triangles:
         raise UserError(
             f"no such mesh; write a file or one of {', '.join(PRIMITIVES)}", file=path
         )
+    if path.suffix.lower() not in MESH_SUFFIXES:
+        raise UserError(
+            f"no mesh format that is read here: {', '.join(sorted(MESH_SUFFIXES))}", file=path
+        )
     import pymeshlab
 
     library: Any = pymeshlab  # its classes come at run time
@@ -104,6 +112,9 @@ def read_mesh(path: str | os.PathLike[str]) -> Triangles:
     keep = face_areas(vertices, faces) > 0
     if not keep.any():
         raise UserError("no face of the mesh has an area", file=path)
+    if not keep.all():
+        dropped = int((~keep).sum())
+        print(f"{path}: {dropped} faces without area are left out", file=sys.stderr)
     return vertices, faces[keep].astype(np.uint32), None
 
 
@@ -122,6 +133,9 @@ def _declared_vertices(path: Path) -> int:
             data = path.read_bytes()
             count = len(re.findall(rb"^[ \t]*v[ \t]", data, re.MULTILINE))
             for line in re.findall(rb"^[ \t]*f[ \t]+(.*)", data, re.MULTILINE):
+                if len(set(line.split())) < 3:
+                    text = line.decode(errors="replace").strip()
+                    raise UserError(f"a face has fewer than three corners: f {text}", file=path)
                 for corner in line.split():
                     number = corner.partition(b"/")[0]
                     index = int(number) if number.lstrip(b"-").isdigit() else 0

@@ -351,8 +351,8 @@ def lights(
     from chromeball.envmap.picture import read_radiance, tone_mapped, write_preview
     from chromeball.scene.record import Stage, write_json
 
-    if count < 1:
-        raise UserError(f"--count {count}: at least one light")
+    if not 1 <= count <= 65536:
+        raise UserError(f"--count {count}: between 1 and 65536 lights")
     image = read_radiance(env)
     radiance, size, kept = image.rgb, image.size, image.attributes
     try:

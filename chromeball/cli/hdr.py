@@ -10,7 +10,7 @@ from typing import Annotated, Any
 from cyclopts import App, Parameter
 
 from chromeball.scene.errors import UserError
-from chromeball.scene.record import Stage, read_json, record_path
+from chromeball.scene.record import Stage, check_output, read_json, record_path
 
 app = App(name="hdr", help="Response curves and radiance maps from bracketed exposures.")
 
@@ -61,6 +61,7 @@ def response(
 
     bracket = read_bracket(inputs, parse_times(times))
     smoothness = SMOOTHNESS if smoothness is None else smoothness
+    check_output(output)
     with Stage(
         "hdr response",
         inputs=bracket.inputs,
@@ -174,6 +175,7 @@ def merge(
         exposures, refined = exposures_for(curve, bracket.exposures)
         if curve.refined:
             _tell(f"refined exposures from {response} for {refined} of {len(exposures)}")
+    check_output(output)
     with Stage(
         "hdr merge",
         inputs=[*bracket.inputs, *([] if response is None else [response])],

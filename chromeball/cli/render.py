@@ -75,7 +75,9 @@ def render(
         TextColumn("{task.completed:.0f} spp"),
         TimeElapsedColumn(),
     )
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+    with Progress(
+        *columns, console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()
+    ) as bar:
         task = bar.add_task("render", total=total, name=chosen.name)
         figures = render_view(
             scene,
@@ -89,10 +91,12 @@ def render(
         json.dump(figures, sys.stdout)
         print()
         return
+    spread = figures["relative_error"]
+    noise = f"{spread:.2%}" if isinstance(spread, float) else "unknown"
     target = output or scene_file.parent / scene.folder / f"{chosen.name}.exr"
     print(
         f"{target}: {figures['spp']} spp in {figures['seconds']:.1f} s, "
         f"{figures['mrays_per_second']:.1f} Mrays/s, {figures['changed_pixels']} pixels "
-        f"changed, standard error {figures['median_standard_error']:.2%} (median); "
+        f"changed, noise {noise} of their mean; "
         f"{figures['png']} beside it"
     )

@@ -47,8 +47,8 @@ def atomic_output(path: str | os.PathLike[str]) -> Generator[Path]:
 
     """
     final = Path(path)
+    check_output(final)
     try:
-        final.parent.mkdir(parents=True, exist_ok=True)
         _remove_leftovers(final)
         handle, name = tempfile.mkstemp(
             prefix=f".{final.stem}.", suffix=final.suffix, dir=final.parent
@@ -68,6 +68,26 @@ def atomic_output(path: str | os.PathLike[str]) -> Generator[Path]:
     finally:
         temporary.unlink(missing_ok=True)
         os.close(handle)
+
+
+def check_output(path: str | os.PathLike[str]) -> None:
+    """Refuse an output that cannot be written, before the work for it is done.
+
+    Raises
+    ------
+    UserError
+        If `path` is a folder, or its own folder cannot be made or written.
+
+    """
+    final = Path(path)
+    if final.is_dir():
+        raise UserError("is a folder; name a file", file=final)
+    try:
+        final.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"cannot write here: {error.strerror}", file=final) from error
+    if not os.access(final.parent, os.W_OK):
+        raise UserError("cannot write here: permission denied", file=final)
 
 
 def _remove_leftovers(final: Path) -> None:
