@@ -177,6 +177,10 @@ class Compositor:
         self._add(np.minimum(whole, 8192).astype(np.uint16))
         self.samples += samples
 
+    def samples_per_pixel(self) -> NDArray[np.float32]:
+        """How many samples each pixel (H, W) has; 0 outside the lens."""
+        return self._film[..., _SAMPLES].copy()
+
     def _add(self, counts: NDArray[np.uint16]) -> None:
         self.rays_traced += self._core.add(
             self._rays, self._camera, self.plate, self._difference, counts, self._film

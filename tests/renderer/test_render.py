@@ -190,3 +190,37 @@ def test_mesh_files_are_read_and_broken_ones_refused(tmp_path: Path) -> None:
     out.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nf 1/1/1 2//2 9\n")
     with pytest.raises(UserError, match="names vertex 9, the mesh has 3"):
         read_mesh(out)
+
+
+def test_a_plate_whose_camera_file_holds_the_pose(scene: Path) -> None:
+    plate = np.random.default_rng(0).uniform(0.1, 1, (30, 40, 3)).astype(np.float32)
+    write_exr(scene.parent / "plate.exr", plate)
+    pose = Pose.look_at(np.array([0.0, 1.0, 2.0]), np.array([0.0, 0.2, 0.0]))
+    CameraModel.pinhole((40, 30), 0.8, pose).write(scene.parent / "posed.cameramodel")
+    text = scene.read_text().replace(
+        "size = [40, 30]", 'plate = "plate.exr"\ncamera = "posed.cameramodel"'
+    )
+    scene.write_text(text)
+    run("render", scene)
+    composite = read_image(scene.parent / "build/main.exr")
+    alpha = composite.pixels[..., composite.channels.index("A")]
+    assert 0 < alpha.mean() < 1
+
+
+def test_samples_are_steered_inside_a_fisheyes_circle_too(scene: Path) -> None:
+    text = scene.read_text().replace(
+        "size = [40, 30]", 'model = "equisolid"\nfov = 120\nsize = [40, 40]'
+    )
+    scene.write_text(text)
+    from chromeball.renderer.render import prepare
+    from chromeball.scene.manifest import read_scene
+
+    parsed = read_scene(scene)
+    job = prepare(parsed, scene.parent, parsed.view[0], 32)
+    for _ in range(4):
+        job.compositor.refine(8)
+    counts = job.compositor.samples_per_pixel()
+    seen = counts > 0
+    assert 0.5 < seen.mean() < 0.9
+    assert counts[seen].mean() == pytest.approx(32, rel=0.02)
+    assert counts[seen].std() > 4

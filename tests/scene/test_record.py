@@ -113,7 +113,7 @@ def test_a_place_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(UserError, match=r"file/out\.txt: cannot write here: "):
         write_text(tmp_path / "file" / "out.txt", "x")
-    with pytest.raises(OSError, match=r"directory"), atomic_output(tmp_path) as temporary:
+    with pytest.raises(UserError, match=r"is a folder"), atomic_output(tmp_path) as temporary:
         temporary.write_text("x")
     assert {p.name for p in tmp_path.parent.glob(f".{tmp_path.name}*")} == set()
 
