@@ -33,14 +33,12 @@ TURN = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])
 
 
 def rows(quick: bool) -> list[Row]:
-    """Shadow rays, then each variant of the scene at a few sample counts."""
+    """Shadow rays, then the scene in direct light at a few sample counts."""
     if not DATA.is_dir():
         return []
     scene: dict[str, Any] = json.loads((DATA / "scene.json").read_text())
     return shadow_rows(quick) + [
-        row
-        for variant in (("direct",) if quick else ("direct", "mg"))
-        for row in composite_rows(scene, variant, quick)
+        row for variant in ("direct",) for row in composite_rows(scene, variant, quick)
     ]
 
 
@@ -89,15 +87,15 @@ def shadow_rows(quick: bool) -> list[Row]:
 
 def composite_rows(scene: dict[str, Any], variant: str, quick: bool) -> list[Row]:
     """One variant of the comparison scene against its own converged picture."""
-    reference = _compositor(scene, variant, 1, 64 if quick else 256)
-    _passes(reference, 64 if quick else 256)
+    reference = _compositor(scene, variant, 1, 128)
+    _passes(reference, 32 if quick else 128)
     truth = _codes(reference.result().rgb)
     found: list[Row] = []
     for spp in (1, 4) if quick else (1, 4, 16):
         start = time.process_time()
         job = _compositor(scene, variant, 0, spp)
         loaded = time.process_time() - start
-        job.add(spp)
+        _passes(job, spp)
         seconds = time.process_time() - start
         error = float(np.sqrt(np.mean((_codes(job.result().rgb) - truth) ** 2)))
         note = f"{spp} spp, of that {loaded:.2f} s to load"
@@ -108,7 +106,7 @@ def composite_rows(scene: dict[str, Any], variant: str, quick: bool) -> list[Row
 
 def _passes(job: Compositor, samples: int) -> None:
     while job.samples < samples:
-        job.add(min(64, samples - job.samples))
+        job.refine(min(16, samples - job.samples))
 
 
 def _codes(rgb: NDArray[np.float32]) -> NDArray[Any]:

@@ -133,7 +133,7 @@ def test_mistakes_are_one_sentence_and_leave_nothing(
         (["response", *bracket, "--times", "1,2", "-o", out], "2 exposure times for 7"),
         (["response", *bracket[:2], "--times", "1,1", "-o", out], "same exposure"),
         (["response", *bracket[:2], "--times", "1,-1", "-o", out], "positive"),
-        (["response", *bracket[:2], "--times", "1,two", "-o", out], "write seconds as"),
+        (["response", *bracket[:2], "--times", "1,two", "-o", out], "is no exposure time"),
         (["response", white, white, "--times", "1,2", "-o", out], "saturated"),
         (["response", deep, deep, "--times", "1,2", "-o", out], "8-bit"),
         (["response", whole, whole, "--times", "1,2", "-o", out], "needs no response"),
