@@ -9,34 +9,19 @@ before the probe is ``set/front.exr``.
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from chromeball.cli.report.figures import TruthError
 from chromeball.hdr.merge import merge_frames
 from chromeball.hdr.response_file import Response, read_response
 from chromeball.scene.camera import CameraModel
 from chromeball.scene.image import read_image, read_rgb, to_display, write_picture
 from chromeball.scene.manifest import Scene
 from chromeball.scene.record import Stage, read_json, write_json
-
-
-@dataclass(frozen=True)
-class Error:
-    """One figure against the truth and the bound it has to keep."""
-
-    stage: str
-    what: str
-    value: float
-    unit: str
-    bound: float
-
-    @property
-    def kept(self) -> bool:
-        """Whether the bound is kept; NaN keeps nothing."""
-        return self.value <= self.bound
 
 
 def compare(scene: Scene, folder: Path) -> None:
@@ -91,25 +76,33 @@ def compare(scene: Scene, folder: Path) -> None:
             write_json(temporary, stage.figures)
 
 
-def response_errors(found: Response, log_exposure: NDArray[np.float64]) -> list[Error]:
+def response_errors(found: Response, log_exposure: NDArray[np.float64]) -> list[TruthError]:
     """RMS of ln exposure over the codes 10 .. 245 of all channels."""
     codes = slice(10, 246)
     difference = found.log_exposure[:, codes] - log_exposure[:, codes]
     rms = float(np.sqrt(np.mean(difference**2)))
-    return [Error("response", "curve, RMS of ln exposure, codes 10-245", 100 * rms, "%", 3.0)]
+    return [
+        TruthError("response", "curve, RMS of ln exposure, codes 10-245", 100 * rms, "%", 3.0)
+    ]
 
 
-def radiance_errors(merged: NDArray[np.float32], radiance: NDArray[np.float32]) -> list[Error]:
+def radiance_errors(
+    merged: NDArray[np.float32], radiance: NDArray[np.float32]
+) -> list[TruthError]:
     """Relative error of the merged fisheye frame, pixel by pixel, inside the lens circle."""
     seen = radiance.min(axis=2) > 0
     error = merged[seen] / radiance[seen] - 1
     return [
-        Error("radiance", "merged frame, median", 100 * float(np.median(abs(error))), "%", 2.0),
-        Error("radiance", "merged frame, bias", 100 * abs(float(np.median(error))), "%", 1.0),
+        TruthError(
+            "radiance", "merged frame, median", 100 * float(np.median(abs(error))), "%", 2.0
+        ),
+        TruthError(
+            "radiance", "merged frame, bias", 100 * abs(float(np.median(error))), "%", 1.0
+        ),
     ]
 
 
-def lens_errors(found: CameraModel, true: CameraModel) -> list[Error]:
+def lens_errors(found: CameraModel, true: CameraModel) -> list[TruthError]:
     """RMS pixel difference over the picture after the best rotation between the two lenses."""
     width, height = true.size
     x, y = np.meshgrid(np.linspace(0, width - 1, 33), np.linspace(0, height - 1, 25))
@@ -119,21 +112,21 @@ def lens_errors(found: CameraModel, true: CameraModel) -> list[Error]:
     rotation = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
     difference = true.project(a @ rotation.T) - pixels
     rms = float(np.sqrt(np.mean(np.sum(difference**2, axis=1))))
-    return [Error("camera", "lens, RMS over the picture", rms, "px", 0.5)]
+    return [TruthError("camera", "lens, RMS over the picture", rms, "px", 0.5)]
 
 
-def pose_errors(found: CameraModel, true: CameraModel) -> list[Error]:
+def pose_errors(found: CameraModel, true: CameraModel) -> list[TruthError]:
     """Place and direction of the view camera."""
     a, b = found.world_from_camera, true.world_from_camera
     offset = float(np.linalg.norm(a.translation - b.translation))
     turn = math.degrees(float(np.linalg.norm((a.inverse() @ b).rotation_vector())))
     return [
-        Error("camera", "place in the room", 1000 * offset, "mm", 30.0),
-        Error("camera", "direction", turn, "deg", 0.5),
+        TruthError("camera", "place in the room", 1000 * offset, "mm", 30.0),
+        TruthError("camera", "direction", turn, "deg", 0.5),
     ]
 
 
-def align_errors(align: dict[str, object], true: CameraModel, depth: float) -> list[Error]:
+def align_errors(align: dict[str, object], true: CameraModel, depth: float) -> list[TruthError]:
     """Floor plane, heading, place of the probe and the rectangle's other side."""
     found = np.array(align["world_from_camera"], float)
     pose = true.world_from_camera
@@ -143,19 +136,23 @@ def align_errors(align: dict[str, object], true: CameraModel, depth: float) -> l
     offset = float(np.linalg.norm(found[:3, 3] - pose.translation))
     derived = abs(float(np.asarray(align["depth"])) / depth - 1)
     return [
-        Error("alignment", "tilt of the floor", tilt, "deg", 0.5),
-        Error("alignment", "heading", yaw, "deg", 0.5),
-        Error("alignment", "place of the probe", 1000 * offset, "mm", 25.0),
-        Error("alignment", "scale, by the carpet's other side", 100 * derived, "%", 2.0),
+        TruthError("alignment", "tilt of the floor", tilt, "deg", 0.5),
+        TruthError("alignment", "heading", yaw, "deg", 0.5),
+        TruthError("alignment", "place of the probe", 1000 * offset, "mm", 25.0),
+        TruthError("alignment", "scale, by the carpet's other side", 100 * derived, "%", 2.0),
     ]
 
 
-def irradiance_errors(found: NDArray[np.float32], true: NDArray[np.float32]) -> list[Error]:
+def irradiance_errors(
+    found: NDArray[np.float32], true: NDArray[np.float32]
+) -> list[TruthError]:
     """Relative error of the irradiance on surfaces facing the six axes, all channels."""
     difference = irradiance(found) / irradiance(true) - 1
     return [
-        Error("environment", "irradiance up", 100 * abs(float(difference[2].mean())), "%", 1.5),
-        Error(
+        TruthError(
+            "environment", "irradiance up", 100 * abs(float(difference[2].mean())), "%", 1.5
+        ),
+        TruthError(
             "environment",
             "irradiance, worst of 6 normals",
             100 * float(abs(difference).max()),
@@ -179,12 +176,14 @@ def irradiance(env: NDArray[np.float32]) -> NDArray[np.float64]:
 
 def composite_errors(
     composite: NDArray[np.float32], photograph: NDArray[np.float32], changed: NDArray[np.bool_]
-) -> list[Error]:
+) -> list[TruthError]:
     """Relative error over the pixels that the objects change, all channels."""
     error = abs(composite[changed] / np.maximum(photograph[changed], 1e-6) - 1)
     return [
-        Error("composite", "changed pixels, median", 100 * float(np.median(error)), "%", 3.0),
-        Error(
+        TruthError(
+            "composite", "changed pixels, median", 100 * float(np.median(error)), "%", 3.0
+        ),
+        TruthError(
             "composite",
             "changed pixels, 90 % of them",
             100 * float(np.quantile(error, 0.9)),
