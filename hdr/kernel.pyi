@@ -19,32 +19,47 @@ def residuals(
     g: NDArray[np.float64],
     tau: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]: ...
-def merge_codes(
+def merge_codes_u8(
     frames: Sequence[NDArray[np.uint8]],
     weight: NDArray[np.float64],
     exposure: NDArray[np.float64],
+    taper: NDArray[np.float64],
+    expected: NDArray[np.float32],
+    saturated: NDArray[np.int64],
     times: NDArray[np.float64],
-    with_sigma: bool,
-) -> tuple[
-    NDArray[np.float32], NDArray[np.float32] | None, NDArray[np.int8], NDArray[np.int64]
-]: ...
+    weak: float,
+    radiance: NDArray[np.float32],
+    sigma: NDArray[np.float32] | None,
+    clipped: NDArray[np.int8],
+) -> NDArray[np.int64]: ...
+def merge_codes_u16(
+    frames: Sequence[NDArray[np.uint16]],
+    weight: NDArray[np.float64],
+    exposure: NDArray[np.float64],
+    taper: NDArray[np.float64],
+    expected: NDArray[np.float32],
+    saturated: NDArray[np.int64],
+    times: NDArray[np.float64],
+    weak: float,
+    radiance: NDArray[np.float32],
+    sigma: NDArray[np.float32] | None,
+    clipped: NDArray[np.int8],
+) -> NDArray[np.int64]: ...
 def merge_linear_u16(
     frames: Sequence[NDArray[np.uint16]],
     times: NDArray[np.float64],
-    white: float,
-    gain: float,
-    read: float,
-    with_sigma: bool,
-) -> tuple[
-    NDArray[np.float32], NDArray[np.float32] | None, NDArray[np.int8], NDArray[np.int64]
-]: ...
+    levels: NDArray[np.float32],
+    columns: int,
+    radiance: NDArray[np.float32],
+    sigma: NDArray[np.float32] | None,
+    clipped: NDArray[np.int8],
+) -> NDArray[np.int64]: ...
 def merge_linear_f32(
     frames: Sequence[NDArray[np.float32]],
     times: NDArray[np.float64],
-    white: float,
-    gain: float,
-    read: float,
-    with_sigma: bool,
-) -> tuple[
-    NDArray[np.float32], NDArray[np.float32] | None, NDArray[np.int8], NDArray[np.int64]
-]: ...
+    levels: NDArray[np.float32],
+    columns: int,
+    radiance: NDArray[np.float32],
+    sigma: NDArray[np.float32] | None,
+    clipped: NDArray[np.int8],
+) -> NDArray[np.int64]: ...

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -7,11 +9,14 @@ from numpy.typing import NDArray
 from chromeball.hdr.merge import (
     SATURATED,
     SENSOR_NOISE,
+    WEAK,
+    code_weights,
     merge_frames,
     merge_linear,
     stops,
     weights,
 )
+from chromeball.hdr.noise import unsaturated
 from chromeball.hdr.response_file import Response
 from chromeball.scene.errors import UserError
 from tests.hdr.camera import TIMES, log_exposure, photograph, scene
@@ -29,22 +34,30 @@ def camera(gamma: float = 2.2, noise: float = 1.0) -> Response:
 
 
 def reference(
-    frames: list[NDArray[np.uint8]], times: NDArray[np.float64], response: Response
+    frames: list[NDArray[Any]], times: NDArray[np.float64], response: Response
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
     """Row P13 in plain numpy: radiance, its error, marks per channel."""
-    w, g = weights(response), response.log_exposure
+    tables, g = code_weights(response), response.log_exposure
     order = np.argsort(times)
     z = np.stack([frames[j] for j in order]).astype(int)
     t = times[order][:, None, None, None]
     channel = np.arange(z.shape[3])
-    X, W = np.exp(g[channel, z]), w[channel, z]
+    counts = unsaturated(z, tables.saturated)
+    X, W, taper = np.exp(g[channel, z]), tables.weight[channel, z] * counts, tables.taper
     total = W.sum(axis=0)
+    lost = total == 0
     with np.errstate(divide="ignore", invalid="ignore"):
         E = (W * X / t).sum(axis=0) / total
+        for _ in range(2):
+            bits = np.nan_to_num(E * t).astype(np.float32).view(np.uint32) >> 16
+            again = (W > 0) * taper[channel, z] * tables.expected[channel, bits]
+            weak = total < WEAK**-2
+            W = np.where(weak, again, W)
+            E, total = (W * X / t).sum(axis=0) / W.sum(axis=0), W.sum(axis=0)
         sigma = E / np.sqrt(total)
-    lost = total == 0
-    high = lost & (z >= 128).any(axis=0)
-    shortest = np.argmax(z >= 128, axis=0)
+    half = response.log_exposure.shape[1] // 2
+    high = lost & (z >= half).any(axis=0)
+    shortest = np.argmax(z >= half, axis=0)
     chosen = np.where(high, shortest, len(frames) - 1)
     bound = np.take_along_axis(X / t, chosen[None], axis=0)[0]
     return (
@@ -145,13 +158,12 @@ def test_linear_merge_equals_its_reference(kind: str) -> None:
     frames = [(v.round() if kind == "uint16" else v).astype(kind) for v in x]
     merged = merge_linear(frames, TIMES, white=white, sigma=True)
     stack = np.stack(frames).astype(float)
-    limit = float(int(SATURATED * white)) if kind == "uint16" else np.float32(SATURATED)
-    keep = stack < limit
+    keep = unsaturated(stack, np.float32(SATURATED * white))
     t = TIMES[:, None, None, None]
     a, b = SENSOR_NOISE[0] * white, SENSOR_NOISE[1] * white**2
     with np.errstate(invalid="ignore", divide="ignore"):
-        poisson = (keep * stack).sum(0) / (keep * t).sum(0)
-        w = keep * t**2 / (a * poisson * t + b)
+        pilot = (keep * stack * t).sum(0) / (keep * t**2).sum(0)
+        w = keep * t**2 / (a * np.maximum(pilot, 0) * t + b)
         expected = (w * stack / t).sum(0) / w.sum(0)
         error = 1 / np.sqrt(w.sum(0))
     lost = ~keep.any(0)
