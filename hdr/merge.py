@@ -138,13 +138,13 @@ def merge_frames(
     exposures: Float,
     response: Response,
     *,
-    noise: CodeNoise | None = None,
+    tables: CodeWeights | None = None,
     sigma: bool = False,
 ) -> Radiance:
     """Merge frames of codes (H, W, C), C of 1 or 3, with the response of their camera.
 
-    uint8 frames need a response of 256 codes, uint16 ones a response of 65536. `noise` is
-    constant in codes, as the response says, unless given.
+    uint8 frames need a response of 256 codes, uint16 ones a response of 65536. `tables` are
+    those of :func:`code_weights`, with the response's own constant noise unless given.
 
     Raises
     ------
@@ -168,7 +168,7 @@ def merge_frames(
             f"{len(response.channels)}: it is of another camera"
         )
     order = np.argsort(exposures, kind="stable")
-    tables = code_weights(response, noise)
+    tables = tables or code_weights(response)
     merge = kernel.merge_codes_u8 if kind == np.uint8 else kernel.merge_codes_u16
     merged = _empty(shape, sigma)
     counts = merge(
@@ -265,37 +265,13 @@ def _by_parity(level: Level, name: str) -> Float:
     return np.broadcast_to(values, (2, 2))[..., None]
 
 
-def stops(merged: Radiance) -> float:
-    """Dynamic range: log2 of the brightest over the darkest measured value (99.99 / 0.01 %)."""
-    measured = merged.radiance[merged.clipped == 0]
-    measured = measured[measured > 0]
+def stops(radiance: NDArray[np.float32]) -> float:
+    """Dynamic range of measured values: log2 of the brightest over the darkest (99.99 / 0.01 %)."""
+    measured = radiance[radiance > 0]
     if measured.size == 0:
         return 0.0
-    low, high = np.percentile(measured[:: max(1, measured.size // 2_000_000)], [0.01, 99.99])
+    low, high = np.percentile(measured, [0.01, 99.99])
     return float(np.log2(high / low))
-
-
-def preview(merged: Radiance, width: int = 640) -> NDArray[np.uint8]:
-    """A small tone-mapped picture (Reinhard et al. 2002, global) to look at, (h, w, 3)."""
-    import cv2
-
-    from chromeball.scene.image import to_display
-
-    pixels = merged.radiance
-    scale = min(1.0, width / pixels.shape[1])
-    size = (
-        max(1, round(pixels.shape[1] * scale)),
-        max(1, round(pixels.shape[0] * scale)),
-    )
-    small = np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.float64)
-    small = small.reshape(size[1], size[0], -1)
-    luminance = small @ [0.2126, 0.7152, 0.0722] if small.shape[2] == 3 else small[..., 0]
-    measured = luminance[luminance > np.percentile(luminance, 99.9) * 1e-6]
-    key = 0.18 / np.exp(np.mean(np.log(measured))) if measured.size else 1.0
-    scaled = luminance * key
-    white = max(1.0, float(np.percentile(scaled, 99.5)))
-    gain = key * (1 + scaled / white**2) / (1 + scaled)
-    return to_display(np.broadcast_to(small * gain[..., None], (size[1], size[0], 3)))
 
 
 def _shape(frames: Sequence[NDArray[Any]], exposures: Float) -> tuple[int, int, int]:

@@ -143,7 +143,7 @@ def merge(
     output: Output,
     times: Times = None,
     response: Annotated[
-        Path | None, Parameter(help="response.json of the camera; needed for 8-bit pictures.")
+        Path | None, Parameter(help="response.json of the camera; needed unless linear.")
     ] = None,
     sigma: Annotated[
         bool, Parameter(negative="", help="Add channels with standard errors.")
@@ -153,21 +153,31 @@ def merge(
     ] = None,
     noise: Annotated[
         tuple[float, float] | None,
-        Parameter(help="Sensor noise a b, var x = a x + b with x a share of white (linear)."),
+        Parameter(
+            help="Sensor noise a b, var x = a x + b with x a share of white (linear); measured "
+            "from the bracket unless given."
+        ),
     ] = None,
+    snr: Annotated[
+        float | None,
+        Parameter(help="Leave out exposures not needed for this signal-to-noise ratio."),
+    ] = None,
+    memory: Annotated[
+        float, Parameter(help="Gigabytes of frames to keep in memory; others are read twice.")
+    ] = 1.0,
     as_json: AsJson = False,
 ) -> None:
     """Merge a bracket into a scene-linear EXR; clipped pixels are marked and counted."""
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from chromeball.hdr.bracket import pictures, read_bracket
-    from chromeball.hdr.merge import SENSOR_NOISE, merge_frames, merge_linear, preview, stops
+    from chromeball.hdr.bracket import Picture, read_bracket
+    from chromeball.hdr.merge_files import prepare_codes, prepare_linear, write_merged
     from chromeball.hdr.response_file import exposures_for, read_response
-    from chromeball.scene.image import write_exr, write_picture
+    from chromeball.hdr.stream import Frames
+    from chromeball.scene.image import write_picture
 
     if output.suffix.lower() != ".exr":
         raise UserError("a radiance map is written as .exr", file=output)
+    if not (memory >= 0):
+        raise UserError(f"--memory {memory:g}: give gigabytes, 0 or more")
     bracket = read_bracket(inputs, parse_times(times))
     curve = None if response is None else read_response(response)
     exposures, refined = bracket.exposures, 0
@@ -176,99 +186,85 @@ def merge(
         if curve.refined:
             _tell(f"refined exposures from {response} for {refined} of {len(exposures)}")
     check_output(output)
-    with Stage(
-        "hdr merge",
-        inputs=[*bracket.inputs, *([] if response is None else [response])],
-        times=times,
-        sigma=sigma,
-        white=white,
-        noise=noise,
-    ) as stage:
-        frames: list[NDArray[Any]] = []
-        channels: tuple[str, ...] = ()
-        linear = False
-        for picture in pictures(bracket, _tell):
-            frames.append(picture.pixels)
-            channels, linear = picture.channels, picture.linear
-            if not linear and str(picture.pixels.dtype) != "uint8":
-                raise UserError(
-                    "16-bit pictures that are not linear cannot be merged: give RAW, EXR or "
-                    "8-bit ones",
-                    file=picture.path,
-                )
-            if not linear and curve is None:
-                raise UserError(
-                    "8-bit pictures need their camera's response: make it with `hdr response` "
-                    "and give it with --response",
-                    file=picture.path,
-                )
-        if linear:
-            if curve is not None:
-                raise UserError(
-                    "linear pictures need no response: leave --response out", file=response
-                )
-            merged = merge_linear(
-                frames, exposures, white=white, noise=noise or SENSOR_NOISE, sigma=sigma
+
+    def check(picture: Picture) -> None:
+        if picture.linear and curve is not None:
+            raise UserError(
+                "linear pictures need no response: leave --response out", file=response
+            )
+        if not picture.linear and curve is None:
+            raise UserError(
+                f"{8 * picture.pixels.itemsize}-bit pictures need their camera's response: make "
+                "it with `hdr response` and give it with --response",
+                file=picture.path,
+            )
+        if not picture.linear and (white is not None or noise is not None):
+            raise UserError("--white and --noise are for linear pictures: leave them out")
+
+    with (
+        Stage(
+            "hdr merge",
+            inputs=[*bracket.inputs, *([] if response is None else [response])],
+            times=times,
+            sigma=sigma,
+            white=white,
+            noise=noise,
+            snr=snr,
+        ) as stage,
+        Frames(
+            bracket, _tell, check, memory=int(memory * 2**30), spool=output.parent
+        ) as frames,
+    ):
+        if curve is None:
+            prepared = prepare_linear(
+                frames, exposures, white=white, noise=noise, sigma=sigma, snr=snr
             )
         else:
-            if white is not None or noise is not None:
-                raise UserError("--white and --noise are for linear pictures: leave them out")
-            assert curve is not None
-            merged = merge_frames(frames, exposures, curve, sigma=sigma)
-        del frames
-        count = merged.radiance.shape[0] * merged.radiance.shape[1]
-        for marked, word, wish in (
-            (merged.high, "saturated", "shorter"),
-            (merged.low, "black", "longer"),
-        ):
-            if np.all(marked == count):
-                raise UserError(f"every pixel is {word} in all pictures: take {wish} exposures")
-        picture_path = output.with_name(output.stem + ".preview.png")
-        stage.figures |= {
-            "channels": channels,
-            "pictures": len(bracket.frames),
-            "size": [merged.radiance.shape[1], merged.radiance.shape[0]],
-            "exposure_scale": bracket.scale,
-            "refined_exposures": refined,
-            "clipped_high": merged.high,
-            "clipped_low": merged.low,
-            "clipped_share": float(np.mean(merged.clipped != 0)),
-            "dynamic_range_stops": stops(merged),
-            "preview": picture_path.name,
-        }
-        planes, names = [merged.radiance], list(channels)
-        if merged.sigma is not None:
-            planes.append(merged.sigma)
-            names += [f"sigma.{name}" for name in channels]
-            stage.figures["relative_sigma_median"] = float(
-                np.median((merged.sigma / merged.radiance)[merged.clipped == 0])
+            prepared = prepare_codes(frames, exposures, curve, sigma=sigma, snr=snr)
+        names = [path.name for path in bracket.paths]
+        for number, reason in prepared.idle.items():
+            _tell(f"{names[number]} measures nothing: {reason}")
+        used = [names[j] for j in prepared.chosen]
+        for row in prepared.figures.get("left_out", []):
+            _tell(
+                f"{row['file']} left out: it would help {100 * row['share_it_would_help']:.2g} % "
+                f"of the values to a signal-to-noise ratio of {snr:g}"
             )
-        planes.append(merged.clipped[..., None].astype(np.float32))
-        names.append("clipped")
         cameras = {frame.camera for frame in bracket.frames if frame.camera}
         attributes: dict[str, Any] = {
             "exposureScale": bracket.scale,
-            "exposures": exposures,
-            "sources": ", ".join(path.name for path in bracket.paths),
+            "exposures": exposures[list(prepared.chosen)],
+            "sources": ", ".join(used),
             "clippedMeaning": "1 saturated in all frames, a lower bound; -1 black in all",
         }
         if len(cameras) == 1:
             attributes["cameraModel"] = cameras.pop()
+        picture_path = output.with_name(output.stem + ".preview.png")
         with stage.output(output) as temporary:
-            write_exr(
-                temporary,
-                np.concatenate(planes, axis=2),
-                channels=names,
-                attributes=attributes,
+            figures, preview = write_merged(
+                temporary, frames, exposures, prepared, sigma=sigma, attributes=attributes
             )
         with stage.output(picture_path) as temporary:
-            write_picture(temporary, preview(merged))
+            write_picture(temporary, preview)
+        stage.figures |= {
+            "channels": frames.channels,
+            "pictures": len(used),
+            "size": [frames.shape[1], frames.shape[0]],
+            "exposure_scale": bracket.scale,
+            "refined_exposures": refined,
+            "measure_nothing": {names[j]: why for j, why in prepared.idle.items()},
+            **prepared.figures,
+            **figures,
+            "preview": picture_path.name,
+        }
     _report(
         output,
         as_json,
         [
-            f"{stage.figures['dynamic_range_stops']:.1f} stops",
-            f"clipped high {_each(merged.high)}, low {_each(merged.low)}",
+            f"{figures['dynamic_range_stops']:.1f} stops",
+            f"clipped high {_each(figures['clipped_high'])}, low {_each(figures['clipped_low'])}",
+            f"noise from {prepared.figures['noise_from']}, "
+            f"chi-square {_each(prepared.figures['chi_square'], '.2f')}",
             f"exposure scale {bracket.scale}",
         ],
     )

@@ -199,15 +199,65 @@ def write_exr(
     Values of `attributes` are str, int, float or sequences of floats; ``chromaticities`` are
     Rec.709 unless given.
     """
-    import OpenImageIO as oiio
-
     pixels = np.ascontiguousarray(pixels, np.float32)
     if pixels.ndim == 2:
         pixels = pixels[..., None]
     height, width, count = pixels.shape
     if count != len(channels):
         raise ValueError(f"{count} channels of pixels, {len(channels)} names")
-    spec = oiio.ImageSpec(width, height, count, "float")
+    spec = _exr_spec((width, height), channels, attributes)
+    with atomic_output(path) as temporary:
+        _write(temporary, spec, pixels, path)
+
+
+@contextmanager
+def exr_rows(
+    path: str | os.PathLike[str],
+    size: tuple[int, int],
+    *,
+    channels: Sequence[str] = ("R", "G", "B"),
+    attributes: Mapping[str, Any] | None = None,
+) -> Generator[Callable[[NDArray[np.float32]], None]]:
+    """As :func:`write_exr` for a picture of `size` (width, height) that comes by rows.
+
+    Yields a function that appends rows (h, W, C) from the top.
+    """
+    import OpenImageIO as oiio
+
+    width, height = size
+    with atomic_output(path) as temporary:
+        target = oiio.ImageOutput.create(os.fspath(temporary))
+        if target is None or not target.open(
+            os.fspath(temporary), _exr_spec(size, channels, attributes)
+        ):
+            raise UserError(f"cannot write: {_reason(oiio.geterror)}", file=path)
+        top = 0
+
+        def append(rows: NDArray[np.float32]) -> None:
+            nonlocal top
+            if rows.shape[1:] != (width, len(channels)):
+                raise ValueError(f"rows of shape {rows.shape}")
+            end = top + len(rows)
+            if not target.write_scanlines(top, end, 0, np.ascontiguousarray(rows)):
+                raise UserError(f"cannot write: {_reason(target.geterror)}", file=path)
+            top = end
+
+        try:
+            yield append
+            if top != height:
+                raise ValueError(f"{top} rows of {height}")
+        finally:
+            closed = target.close()
+        if not closed:
+            raise UserError(f"cannot write: {_reason(target.geterror)}", file=path)
+
+
+def _exr_spec(
+    size: tuple[int, int], channels: Sequence[str], attributes: Mapping[str, Any] | None
+) -> Any:
+    import OpenImageIO as oiio
+
+    spec = oiio.ImageSpec(*size, len(channels), "float")
     spec.channelnames = tuple(channels)
     spec.attribute("compression", "zip")
     merged: dict[str, Any] = {"chromaticities": REC709_CHROMATICITIES, **(attributes or {})}
@@ -223,8 +273,7 @@ def write_exr(
                 flat = tuple(float(v) for v in np.ravel(value))
                 kind = "float" if len(flat) == 1 else f"float[{len(flat)}]"
                 spec.attribute(name, oiio.TypeDesc(kind), flat)
-    with atomic_output(path) as temporary:
-        _write(temporary, spec, pixels, path)
+    return spec
 
 
 def write_picture(

@@ -185,7 +185,7 @@ def test_linear_extremes() -> None:
     black = merge_linear([np.zeros((2, 2, 3), np.uint16)] * 2, np.array([1.0, 2.0]))
     assert np.all(black.clipped == -1)
     assert np.all(black.radiance == 0)
-    assert stops(black) == 0
+    assert stops(black.radiance) == 0
 
 
 def test_bad_input_is_refused() -> None:
