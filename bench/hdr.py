@@ -1,8 +1,8 @@
-"""Response and merge: CPU seconds against error, beside OpenCV.
+"""Response: CPU seconds against error, beside OpenCV; merges are in `hdr_merge`.
 
 Ten DoRF curves (Grossberg and Nayar 2003) photograph real radiance maps: 7 pictures of 1
 megapixel, one stop apart, full well 15000 e-, read noise 5 e-, 8 bits. Errors are RMS of ln
-exposure over the codes 5 .. 250, zero at code 128, and relative errors of the merged radiance.
+exposure over the codes 5 .. 250, zero at code 128.
 """
 
 from __future__ import annotations
@@ -17,9 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.row import Row
-from chromeball.hdr.merge import merge_frames
 from chromeball.hdr.response import sample, solve
-from chromeball.hdr.response_file import Response
 from chromeball.scene.image import read_image
 
 DATA = Path(__file__).resolve().parents[1].parent / "shared/data/hdr"
@@ -41,7 +39,9 @@ def rows(quick: bool = False) -> list[Row]:
     """The rows of this room; none where the shared data set is absent."""
     if not (DATA / "dorf.npz").is_file():
         return []
-    return [*response_rows(quick), *merge_rows(quick)]
+    from bench import hdr_merge
+
+    return [*response_rows(quick), *hdr_merge.rows(quick)]
 
 
 def response_rows(quick: bool) -> list[Row]:
@@ -54,10 +54,10 @@ def response_rows(quick: bool) -> list[Row]:
     }
     seconds: dict[str, list[float]] = {name: [] for name in tools}
     errors: dict[str, list[float]] = {name: [] for name in tools}
-    _ours(_photograph(_radiance(MAPS[0], 0.05), _curve(0)[0]))  # compiles
+    _ours(photograph(radiance(MAPS[0], 0.05), curve(0)[0]))  # compiles
     for k, number in enumerate(np.linspace(0, 110, 5 if quick else 10).astype(int)):
-        transfer, truth = _curve(int(number))
-        frames = _photograph(_radiance(MAPS[k % len(MAPS)], megapixels), transfer)
+        transfer, truth = curve(int(number))
+        frames = photograph(radiance(MAPS[k % len(MAPS)], megapixels), transfer)
         for name, tool in tools.items():
             start = time.process_time()
             g = tool(frames)
@@ -85,51 +85,6 @@ def response_rows(quick: bool) -> list[Row]:
     ]
 
 
-def merge_rows(quick: bool) -> list[Row]:
-    """Our merge beside OpenCV's, both with the true response."""
-    megapixels = 1.0 if quick else 12.0
-    transfer, truth = _curve(33)
-    radiance = _radiance("polyhaven_apartment", megapixels)
-    frames = _photograph(radiance, transfer)
-    known = Response.from_log_exposure(np.repeat(truth, 3, axis=0))
-    curve = np.exp(truth[0]).astype(np.float32)
-    table = np.repeat(curve[:, None, None], 3, axis=2)
-    times = TIMES.astype(np.float32)
-    tools: dict[str, Callable[[], NDArray[Any]]] = {
-        "chromeball": lambda: merge_frames(frames, TIMES, known).radiance,
-        "OpenCV Debevec": lambda: np.asarray(
-            cv2.createMergeDebevec().process(frames, times, table)
-        ),
-        "OpenCV Robertson": lambda: np.asarray(
-            cv2.createMergeRobertson().process(frames, times, table)
-        ),
-    }
-    found: list[Row] = []
-    for name, tool in tools.items():
-        start = time.process_time()
-        merged = tool()
-        seconds = time.process_time() - start
-        shown = (radiance * TIMES[0] < 0.9) & (radiance * TIMES[-1] > 0.002)
-        ratio = merged[shown] / radiance[shown]
-        error = float(np.sqrt(np.mean(np.log(np.maximum(ratio / np.median(ratio), 1e-6)) ** 2)))
-        found.append(
-            Row("hdr", f"merge, 7 x {megapixels:g} MP", name, seconds, error, "ln RMS")
-        )
-    ours = found[0].cpu_seconds
-    return [
-        Row(
-            row.stage,
-            row.what,
-            row.tool,
-            row.cpu_seconds,
-            row.error,
-            row.unit,
-            f"{7 * megapixels / row.cpu_seconds:.0f} MP/s, {row.cpu_seconds / ours:.1f} x ours",
-        )
-        for row in found
-    ]
-
-
 def _ours(frames: Frames) -> Float:
     return solve([sample(frame) for frame in frames], TIMES).g
 
@@ -142,7 +97,7 @@ def _opencv(tool: Any, frames: Frames) -> Float:
     return np.where(np.isfinite(g), g, np.nan)
 
 
-def _curve(number: int) -> tuple[tuple[Float, Float], Float]:
+def curve(number: int) -> tuple[tuple[Float, Float], Float]:
     """A DoRF curve as (irradiance, brightness), and the true ln exposure per code, (1, 256)."""
     dorf = np.load(DATA / "dorf.npz")
     x = dorf["irradiance"][number].astype(np.float64)
@@ -152,7 +107,8 @@ def _curve(number: int) -> tuple[tuple[Float, Float], Float]:
     return (x, z), (g - g[128])[None]
 
 
-def _radiance(name: str, megapixels: float) -> Float:
+def radiance(name: str, megapixels: float) -> Float:
+    """A radiance map of the data set, resized, its median 0.18."""
     # some of the maps hold a few negative values: no light reaches the emulated sensor there
     picture = np.maximum(read_image(DATA / "radiance" / f"{name}.exr").pixels[..., :3], 0)
     scale = np.sqrt(megapixels * 1e6 / (picture.shape[0] * picture.shape[1]))
@@ -161,10 +117,11 @@ def _radiance(name: str, megapixels: float) -> Float:
     return np.asarray(resized, np.float64) * (0.18 / np.median(picture[picture > 0]))
 
 
-def _photograph(radiance: Float, transfer: tuple[Float, Float]) -> Frames:
+def photograph(radiance: Float, transfer: tuple[Float, Float], times: Float = TIMES) -> Frames:
+    """8-bit pictures of a radiance map by the emulated camera."""
     rng = np.random.default_rng(0)
     frames: Frames = []
-    for t in TIMES:
+    for t in times:
         electrons = rng.poisson(np.minimum(radiance * t, 2) * FULL_WELL).astype(np.float64)
         electrons += rng.normal(0, READ_NOISE, radiance.shape)
         z = np.interp(np.clip(electrons / FULL_WELL, 0, 1), *transfer)

@@ -36,7 +36,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chromeball.hdr import kernel
-from chromeball.hdr.noise import CodeNoise
+from chromeball.hdr.noise import CodeNoise, slopes
 from chromeball.hdr.response_file import Response
 from chromeball.scene.errors import UserError
 
@@ -77,8 +77,8 @@ class Radiance:
 class CodeWeights:
     """The tables of a merge of codes.
 
-    ``weight``, ``taper`` (C, codes): taper over the variance of ln X, and the taper alone, which
-    falls to zero at saturation; ``saturated`` (C,): the code it begins with; ``expected``
+    ``weight``, ``taper`` (C, codes): taper over the variance of ln X, and the taper alone,
+    which falls to zero at saturation; ``saturated`` (C,): the code it begins with; ``expected``
     (C, 2^15) float32: 1 / variance at an exposure X, by the upper 16 bits of its float32.
     """
 
@@ -107,13 +107,15 @@ def code_weights(response: Response, noise: CodeNoise | None = None) -> CodeWeig
         model = (slope * noise.code[:, None]) ** 2 + a * np.exp(-ln_x) + b * np.exp(-2 * ln_x)
         return np.maximum(model, floor)
 
-    at_codes = variance(np.gradient(g, axis=1), g) + response.sigma**2
-    # a code that leaves its exposure open by a factor of e or more measures nothing
-    known = at_codes < 1
+    at_codes = variance(slopes(g), g) + response.sigma**2
+    # where the curve leaves a code's exposure open by a factor of e or more it measures nothing
+    known = (slopes(g) ** 2 / 12 + response.sigma**2 < 1) & (taper > 0)
     bits = np.minimum(np.arange(1 << 15, dtype=np.uint32), 0x7F00) << 16 | 1 << 15
     x = np.clip(bits.view(np.float32).astype(np.float64), 1e-30, 1e30)
     grid = np.log(np.broadcast_to(x, (len(g), len(x))))
-    interval = np.stack([np.searchsorted(c, r, side="right") for c, r in zip(g, grid, strict=True)])
+    interval = np.stack(
+        [np.searchsorted(c, r, side="right") for c, r in zip(g, grid, strict=True)]
+    )
     interval = np.clip(interval - 1, 0, N - 2)
     slope = np.take_along_axis(np.diff(g, axis=1), interval, axis=1)
     inside = np.clip(grid, g[:, :1], g[:, -1:])
@@ -155,7 +157,7 @@ def merge_frames(
     shape = _shape(frames, exposures)
     codes = response.log_exposure.shape[1]
     kind = frames[0].dtype
-    if kind not in (np.uint8, np.uint16):
+    if kind != np.uint8 and kind != np.uint16:
         raise UserError(f"pictures of {kind} values: 8-bit or 16-bit codes are needed")
     if codes != np.iinfo(kind).max + 1:
         raise UserError(
@@ -210,7 +212,7 @@ def merge_linear(
     """
     shape = _shape(frames, exposures)
     kind = frames[0].dtype
-    if kind not in (np.uint16, np.float32):
+    if kind != np.uint16 and kind != np.float32:
         raise UserError(f"linear pictures of {kind} values: 16-bit or float ones are needed")
     if white is None:
         white = 65535.0 if kind == np.uint16 else max(float(f.max()) for f in frames)
@@ -231,7 +233,9 @@ def levels(
     black: Level, white: Level, noise: Level, channels: int, most: float = np.inf
 ) -> NDArray[np.float32]:
     """(2, 2, C, 5): black, first saturated value, a / scale, b and scale = white - black."""
-    dark, top = (_by_parity(level, name) for level, name in ((black, "black"), (white, "white")))
+    dark, top = (
+        _by_parity(level, name) for level, name in ((black, "black"), (white, "white"))
+    )
     if np.any(top > most):
         raise UserError(f"16-bit pictures hold no white of {top.max():g}; it is at most 65535")
     if np.all(top <= 0):
@@ -266,7 +270,7 @@ def _by_parity(level: Level, name: str) -> Float:
 
 
 def stops(radiance: NDArray[np.float32]) -> float:
-    """Dynamic range of measured values: log2 of the brightest over the darkest (99.99 / 0.01 %)."""
+    """Dynamic range of measured values: log2 of their 99.99 over their 0.01 % quantile."""
     measured = radiance[radiance > 0]
     if measured.size == 0:
         return 0.0

@@ -168,7 +168,9 @@ def write_merged(
             high, low, negative = high + part.high, low + part.low, negative + part.negative
             clipped += int(np.count_nonzero(part.clipped))
             planes = [part.radiance, *([] if part.sigma is None else [part.sigma])]
-            append(np.concatenate([*planes, part.clipped[..., None].astype(np.float32)], axis=2))
+            append(
+                np.concatenate([*planes, part.clipped[..., None].astype(np.float32)], axis=2)
+            )
             preview.add(top, part.radiance)
             some = slice(-top % stride, None, stride), slice(None, None, stride)
             keep = part.clipped[some] == 0

@@ -64,12 +64,19 @@ class Fit:
     outliers: Float
 
 
-def lattice(shape: tuple[int, int], count: int = 40_000) -> tuple[slice, slice]:
-    """Rows and columns of about `count` pixels spread over a picture (odd steps, so that all
-    four parities of a mosaic are met).
+def lattice(shape: tuple[int, int], count: int = 12_000) -> tuple[slice, slice]:
+    """Rows and columns of about `count` pixels spread over a picture.
+
+    Steps are odd, so that all four parities of a mosaic are met.
     """
     step = max(1, int(math.sqrt(shape[0] * shape[1] / count))) | 1
     return slice(step // 2, None, step), slice(step // 2, None, step)
+
+
+def slopes(g: Float) -> Float:
+    """g'(z), to the next code: the lowest code is open below, and its g says little."""
+    rise = np.diff(g, axis=-1)
+    return np.concatenate([rise, rise[..., -1:]], axis=-1)
 
 
 def measure_codes(
@@ -83,7 +90,7 @@ def measure_codes(
     found: list[Float] = []
     for c, g in enumerate(response.log_exposure):
         z = np.stack([frame[:, c] for frame in samples]).astype(np.intp)
-        slope = np.gradient(g)
+        slope = slopes(g)
         basis = np.stack([slope**2, np.exp(-g), np.exp(-2 * g)], axis=1)
         margin = 3 * max(1, (N - 1) // 255)
         usable = unsaturated(z, N - margin) & (z > margin)
@@ -146,10 +153,10 @@ def _studentised(
 ) -> tuple[Float, Float, NDArray[np.bool_]]:
     """Squared residuals over their variance (P, N), weighted means (N,), which count."""
     w = np.where(usable, 1 / v, 0.0)
-    W = w.sum(axis=0)
-    W = np.where(W > 0, W, np.inf)
-    mean = (w * np.where(usable, y, 0)).sum(axis=0) / W
-    freedom = 1 - w / W
+    total = w.sum(axis=0)
+    total[total <= 0] = np.inf
+    mean = (w * np.where(usable, y, 0)).sum(axis=0) / total
+    freedom = 1 - w / total
     keep = usable & (freedom > _LEAST_FREEDOM)
     u2 = np.where(keep, (y - mean) ** 2 / (v * np.where(keep, freedom, 1)), 0.0)
     return u2, mean, keep

@@ -31,9 +31,7 @@ class Preview:
         """The tone-mapped picture (h, w, 3)."""
         if self._sum is None:
             raise ValueError("no rows were added")
-        high, wide = (
-            np.minimum(self._k, n - np.arange(0, n, self._k)) for n in self._shape
-        )
+        high, wide = (np.minimum(self._k, n - np.arange(0, n, self._k)) for n in self._shape)
         return tone_map(self._sum / (high[:, None] * wide)[..., None])
 
 

@@ -22,8 +22,10 @@ LOSS = 0.05
 
 @dataclass(frozen=True)
 class Choice:
-    """`kept` and `left_out`: numbers of frames; `cost` of each left out: the share of values
-    that would reach their need with it alone put back, and do not without.
+    """Numbers of the frames `kept` and `left_out`.
+
+    ``cost`` of each left out: the share of values that would reach their need with it alone
+    put back, and do not without.
     """
 
     kept: tuple[int, ...]

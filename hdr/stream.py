@@ -1,8 +1,8 @@
 """A bracket larger than memory: its frames by bands of rows.
 
-Every frame is read once whole, to see that it is sound and to take a sample of it. While there is
-room, frames stay in memory; the others are read again by rows through OpenImageIO, or, where a
-format cannot be read by rows (RAW, progressive JPEG, interlaced PNG, tiles), from a temporary
+Every frame is read once whole, to see that it is sound and to take a sample of it. While there
+is room, frames stay in memory; the others are read again by rows through OpenImageIO, or, where
+a format cannot be read by rows (RAW, progressive JPEG, interlaced PNG, tiles), from a temporary
 file without a name, which vanishes with the process.
 """
 
@@ -32,7 +32,7 @@ BAND = 48 << 20
 #: files open at a time; further frames go to a temporary file
 MOST_FILES = 200
 #: samples of all frames together; one frame gives between the two numbers below
-_SAMPLES, _FEWEST, _MOST = 800_000, 4_000, 40_000
+_SAMPLES, _FEWEST, _MOST = 240_000, 4_000, 12_000
 _BY_ROWS = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".exr", ".hdr"})
 
 type Rows = Callable[[int, int], NDArray[Any]]
@@ -135,7 +135,8 @@ class Frames:
 
     def _spooled(self, pixels: NDArray[Any]) -> Rows:
         try:
-            file = self._open.enter_context(tempfile.TemporaryFile(dir=self.spool))
+            nameless = tempfile.TemporaryFile(dir=self.spool)  # noqa: SIM115 (closed by the stack)
+            file = self._open.enter_context(nameless)
             pixels.tofile(file)
         except OSError as error:
             raise UserError(

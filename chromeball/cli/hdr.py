@@ -194,8 +194,8 @@ def merge(
             )
         if not picture.linear and curve is None:
             raise UserError(
-                f"{8 * picture.pixels.itemsize}-bit pictures need their camera's response: make "
-                "it with `hdr response` and give it with --response",
+                f"{8 * picture.pixels.itemsize}-bit pictures need their camera's response: "
+                "make it with `hdr response` and give it with --response",
                 file=picture.path,
             )
         if not picture.linear and (white is not None or noise is not None):
@@ -227,8 +227,9 @@ def merge(
         used = [names[j] for j in prepared.chosen]
         for row in prepared.figures.get("left_out", []):
             _tell(
-                f"{row['file']} left out: it would help {100 * row['share_it_would_help']:.2g} % "
-                f"of the values to a signal-to-noise ratio of {snr:g}"
+                f"{row['file']} left out: it would help "
+                f"{100 * row['share_it_would_help']:.2g} % of the values to a "
+                f"signal-to-noise ratio of {snr:g}"
             )
         cameras = {frame.camera for frame in bracket.frames if frame.camera}
         attributes: dict[str, Any] = {
@@ -262,7 +263,8 @@ def merge(
         as_json,
         [
             f"{figures['dynamic_range_stops']:.1f} stops",
-            f"clipped high {_each(figures['clipped_high'])}, low {_each(figures['clipped_low'])}",
+            f"clipped high {_each(figures['clipped_high'])}, "
+            f"low {_each(figures['clipped_low'])}",
             f"noise from {prepared.figures['noise_from']}, "
             f"chi-square {_each(prepared.figures['chi_square'], '.2f')}",
             f"exposure scale {bracket.scale}",

@@ -43,25 +43,25 @@ def reference(
     t = times[order][:, None, None, None]
     channel = np.arange(z.shape[3])
     counts = unsaturated(z, tables.saturated)
-    X, W, taper = np.exp(g[channel, z]), tables.weight[channel, z] * counts, tables.taper
-    total = W.sum(axis=0)
+    X, w, taper = np.exp(g[channel, z]), tables.weight[channel, z] * counts, tables.taper
+    used, total = w, w.sum(axis=0)
     lost = total == 0
     with np.errstate(divide="ignore", invalid="ignore"):
-        E = (W * X / t).sum(axis=0) / total
+        value = (w * X / t).sum(axis=0) / total
         for _ in range(2):
-            bits = np.nan_to_num(E * t).astype(np.float32).view(np.uint32) >> 16
-            again = (W > 0) * taper[channel, z] * tables.expected[channel, bits]
-            weak = total < WEAK**-2
-            W = np.where(weak, again, W)
-            E, total = (W * X / t).sum(axis=0) / W.sum(axis=0), W.sum(axis=0)
-        sigma = E / np.sqrt(total)
+            bits = np.nan_to_num(value * t).astype(np.float32).view(np.uint32) >> 16
+            again = (w > 0) * taper[channel, z] * tables.expected[channel, bits]
+            used = np.where(total < WEAK**-2, again, used)
+            total = used.sum(axis=0)
+            value = (used * X / t).sum(axis=0) / total
+        sigma = value / np.sqrt(total)
     half = response.log_exposure.shape[1] // 2
     high = lost & (z >= half).any(axis=0)
     shortest = np.argmax(z >= half, axis=0)
     chosen = np.where(high, shortest, len(frames) - 1)
     bound = np.take_along_axis(X / t, chosen[None], axis=0)[0]
     return (
-        np.where(lost, bound, E),
+        np.where(lost, bound, value),
         np.where(lost, np.inf, sigma),
         high * 1 - (lost & ~high) * 1,
     )
