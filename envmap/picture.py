@@ -54,7 +54,7 @@ def read_radiance(path: str | os.PathLike[str]) -> Radiance:
             "not a scene-linear picture; merge it with `hdr merge` first", file=path
         )
     names = list(image.channels)
-    pixels = image.pixels.astype(np.float32, copy=False)
+    pixels = image.radiance()
     if all(name in names for name in "RGB"):
         rgb = pixels[..., [names.index(name) for name in "RGB"]]
     elif len(names) in (1, 2):

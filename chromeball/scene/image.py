@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 import os
 import zlib
-from collections.abc import Callable, Generator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -21,8 +20,6 @@ from chromeball.scene.record import atomic_output
 RAW_SUFFIXES = frozenset(
     {".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw"}
 )
-#: 16-bit sensor values from here on are saturated.
-_RAW_SATURATED = 64880
 LINEAR_SUFFIXES = frozenset({".exr", ".hdr", ".pfm"}) | RAW_SUFFIXES
 
 
@@ -46,6 +43,11 @@ class Image:
 
     ``pixels`` is (H, W, C) in its own type: uint8, uint16 or float32 (half is widened).
     ``linear`` says that the values are proportional to radiance (EXR, HDR, RAW).
+
+    RAW pictures are float32 linear Rec.709 shares of the sensor's white, nothing clipped:
+    noise about black and colours outside the gamut are negative. Theirs alone are
+    ``saturated`` (H, W), which pixels come from saturated sensor values, and ``white``, which
+    no other pixel's colour exceeds.
     """
 
     pixels: NDArray[Any]
@@ -53,11 +55,22 @@ class Image:
     channels: tuple[str, ...]
     exposure: Exposure = field(default_factory=Exposure)
     attributes: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    saturated: NDArray[np.bool_] | None = None
+    white: float | None = None
 
     @property
     def size(self) -> tuple[int, int]:
         """Width and height in pixels."""
         return self.pixels.shape[1], self.pixels.shape[0]
+
+    def radiance(self) -> NDArray[np.float32]:
+        """The pixels as float32; of a RAW picture the negative ones are 0.
+
+        There they are noise and colours that Rec.709 cannot show, in other pictures a mistake
+        that is left for the caller to see.
+        """
+        pixels = self.pixels.astype(np.float32, copy=False)
+        return pixels if self.saturated is None else np.maximum(pixels, 0)
 
 
 def read_image(path: str | os.PathLike[str]) -> Image:
@@ -73,7 +86,18 @@ def read_image(path: str | os.PathLike[str]) -> Image:
     if not path.is_file():
         raise UserError("no such picture", file=path)
     if path.suffix.lower() in RAW_SUFFIXES:
-        return _read_raw(path)
+        from chromeball.scene.raw import read_developed
+
+        raw = read_developed(path)
+        return Image(
+            pixels=raw.pixels,
+            linear=True,
+            channels=("R", "G", "B"),
+            exposure=raw.exposure,
+            attributes=raw.attributes,
+            saturated=raw.saturated,
+            white=raw.white,
+        )
     if not _png_is_whole(path):  # asked first: libpng complains on stderr by itself
         raise UserError("truncated or damaged picture: the PNG is not whole", file=path)
     import OpenImageIO as oiio
@@ -99,7 +123,7 @@ def read_image(path: str | os.PathLike[str]) -> Image:
         pixels=pixels,
         linear=path.suffix.lower() in LINEAR_SUFFIXES or base == "float",
         channels=tuple(spec.channelnames),
-        exposure=_exposure(attributes),
+        exposure=exposure_of(attributes),
         attributes=attributes,
     )
 
@@ -127,9 +151,10 @@ def read_header(path: str | os.PathLike[str]) -> Header:
     if not path.is_file():
         raise UserError("no such picture", file=path)
     if path.suffix.lower() in RAW_SUFFIXES:
-        with _open_raw(path) as raw:
-            size = raw.sizes.width, raw.sizes.height
-            return Header(size, ("R", "G", "B"), _raw_exposure(raw, path), {})
+        from chromeball.scene.raw import raw_header
+
+        size, exposure = raw_header(path)
+        return Header(size, ("R", "G", "B"), exposure, {})
     import OpenImageIO as oiio
 
     source = oiio.ImageInput.open(os.fspath(path))
@@ -141,7 +166,7 @@ def read_header(path: str | os.PathLike[str]) -> Header:
         attributes = {a.name: a.value for a in spec.extra_attribs}
     finally:
         source.close()
-    return Header(size, channels, _exposure(attributes), attributes)
+    return Header(size, channels, exposure_of(attributes), attributes)
 
 
 def read_exposure(path: str | os.PathLike[str]) -> Exposure:
@@ -157,6 +182,8 @@ def read_size(path: str | os.PathLike[str]) -> tuple[int, int]:
 def read_rgb(path: str | os.PathLike[str]) -> NDArray[np.float32]:
     """Read a scene-linear picture as (H, W, 3) float32; grey is repeated, alpha left out.
 
+    Of a RAW picture negative values are 0, see :meth:`Image.radiance`.
+
     Raises
     ------
     UserError
@@ -168,7 +195,7 @@ def read_rgb(path: str | os.PathLike[str]) -> NDArray[np.float32]:
         raise UserError(
             "not a scene-linear picture; merge it with `hdr merge` first", file=path
         )
-    pixels = image.pixels.astype(np.float32, copy=False)
+    pixels = image.radiance()
     names = list(image.channels)
     if all(name in names for name in "RGB"):
         rgb = pixels[..., [names.index(name) for name in "RGB"]]
@@ -328,69 +355,16 @@ def _write(
         raise UserError(f"cannot write: {_reason(target.geterror)}", file=path)
 
 
-@contextmanager
-def _open_raw(path: Path) -> Generator[Any]:
-    import rawpy
-
-    try:
-        with rawpy.imread(os.fspath(path)) as raw:
-            yield raw
-    except (rawpy.LibRawError, OSError) as error:
-        reason = error.args[0] if error.args else error
-        if isinstance(reason, bytes):
-            reason = reason.decode(errors="replace")
-        raise UserError(
-            f"unknown, truncated or damaged RAW picture: {reason}", file=path
-        ) from error
-
-
-def _read_raw(path: Path) -> Image:
-    import rawpy
-
-    with _open_raw(path) as raw:
-        linear: dict[str, Any] = {"gamma": (1, 1), "no_auto_bright": True, "output_bps": 16}
-        pixels = raw.postprocess(
-            use_camera_wb=True, output_color=rawpy.ColorSpace.sRGB, user_flip=0, **linear
-        )
-        # the sensor's own channels say what is saturated; the colour matrix would hide it
-        sensor = raw.postprocess(
-            user_wb=[1, 1, 1, 1], output_color=rawpy.ColorSpace.raw, user_flip=0, **linear
-        )
-        pixels[(sensor >= _RAW_SATURATED).any(axis=2)] = 65535
-        exposure = _raw_exposure(raw, path)
-    return Image(pixels=pixels, linear=True, channels=("R", "G", "B"), exposure=exposure)
-
-
-def _raw_exposure(raw: Any, path: Path) -> Exposure:
-    """From the EXIF where OpenImageIO reads the container (DNG and most others are TIFF).
-
-    LibRaw is asked otherwise: it makes 1 s and f/1 of metadata that is there and empty.
-    """
-    import OpenImageIO as oiio
-
-    source = oiio.ImageInput.open(os.fspath(path))
-    if source is None:
-        oiio.geterror()  # forget it: LibRaw knows more containers
-        return Exposure(
-            time=_positive(raw.other.shutter_speed),
-            aperture=_positive(raw.other.aperture),
-            iso=_positive(raw.other.iso_speed),
-        )
-    try:
-        return _exposure({a.name: a.value for a in source.spec().extra_attribs})
-    finally:
-        source.close()
-
-
-def _exposure(attributes: Mapping[str, Any]) -> Exposure:
-    time = _positive(attributes.get("ExposureTime"))
+def exposure_of(attributes: Mapping[str, Any]) -> Exposure:
+    """Exposure metadata from OpenImageIO's attributes."""
+    time = positive(attributes.get("ExposureTime"))
     apex = attributes.get("Exif:ShutterSpeedValue")
     if "ExposureTime" not in attributes and isinstance(apex, int | float) and abs(apex) < 64:
-        time = _positive(2.0**-apex)
+        time = positive(2.0**-apex)
     return Exposure(
         time=time,
-        aperture=_positive(attributes.get("FNumber")),
-        iso=_positive(
+        aperture=positive(attributes.get("FNumber")),
+        iso=positive(
             attributes.get(
                 "Exif:PhotographicSensitivity", attributes.get("Exif:ISOSpeedRatings")
             )
@@ -400,7 +374,8 @@ def _exposure(attributes: Mapping[str, Any]) -> Exposure:
     )
 
 
-def _positive(value: Any) -> float | None:
+def positive(value: Any) -> float | None:
+    """A finite positive number, or the first of several; None for all else."""
     if isinstance(value, tuple) and value:
         value = value[0]
     if isinstance(value, int | float | np.number) and math.isfinite(value) and value > 0:
