@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 MATRIX = ((0.65, -0.18, -0.06), (-0.47, 1.24, 0.25), (-0.09, 0.18, 0.60))
 LETTERS = {"R": 0, "G": 1, "B": 2}
 
-type Field = tuple[int, int, Sequence[float] | bytes]  # tag, type, values
+type Field = tuple[int, int, Sequence[int | float] | bytes]  # tag, type, values
 
 _BYTE, _ASCII, _SHORT, _LONG, _RATIONAL, _SRATIONAL, _DOUBLE = 1, 2, 3, 4, 5, 10, 12
 _PACKING = {_BYTE: "B", _SHORT: "H", _LONG: "I", _DOUBLE: "d"}
@@ -49,9 +49,9 @@ class Sensor:
         a, b = self.noise
         x = rng.poisson(np.maximum(radiance * exposure, 0) / a) * a
         x = x + rng.normal(0, np.sqrt(b), x.shape)
-        black = np.tile(
-            np.reshape(self.black, (2, 2)), [-(-n // 2) for n in x.shape]
-        )[: x.shape[0], : x.shape[1]]
+        black = np.tile(np.reshape(self.black, (2, 2)), [-(-n // 2) for n in x.shape])[
+            : x.shape[0], : x.shape[1]
+        ]
         codes = np.round(black + x * (self.white - black))
         return np.clip(codes, 0, self.white).astype(np.uint16)
 
@@ -109,12 +109,11 @@ def write_dng(
         fields += [(50721, _SRATIONAL, np.ravel(matrix).tolist()), (50778, _SHORT, [21])]
     if noise_profile:
         fields.append((51041, _DOUBLE, [*sensor.noise] * 3))
-    # the directories' sizes do not depend on the offsets in them: pack twice
-    places = {34665: 0, 273: 0}
-    for _ in range(2):
-        first = _directory([*fields, *((tag, _LONG, [at]) for tag, at in places.items())], 8)
-        second = _directory(exif, 8 + len(first))
-        places = {34665: 8 + len(first), 273: 8 + len(first) + len(second)}
+    # a directory's size does not depend on the offsets in it
+    size = len(_directory([*fields, (34665, _LONG, [0]), (273, _LONG, [0])], 8))
+    second = _directory(exif, 8 + size)
+    places: list[Field] = [(34665, _LONG, [8 + size]), (273, _LONG, [8 + size + len(second)])]
+    first = _directory([*fields, *places], 8)
     data = codes.astype("<u2").tobytes()
     Path(path).write_bytes(struct.pack("<2sHI", b"II", 42, 8) + first + second + data)
 

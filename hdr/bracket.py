@@ -1,7 +1,8 @@
 """A bracket: which pictures, how much light each was given, and the pictures themselves.
 
 A frame's exposure is ``time * ISO / 100 / N^2`` where aperture and ISO are known for all
-frames, its time in seconds otherwise, so that all brackets of one camera share one scale.
+frames, its time in seconds otherwise, so that all brackets of one camera share one scale. A
+neutral-density filter multiplies it by its transmission, 2^-stops.
 """
 
 from __future__ import annotations
@@ -17,8 +18,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from chromeball.hdr.exposure import contradictions, transmissions
 from chromeball.scene.errors import UserError
-from chromeball.scene.image import Exposure, read_exposure, read_image
+from chromeball.scene.image import RAW_SUFFIXES, Exposure, read_exposure, read_image
+from chromeball.scene.raw import Mosaic, read_mosaic
 
 
 @dataclass(frozen=True)
@@ -40,29 +43,43 @@ class Bracket:
     exposures: NDArray[np.float64]  # (P,)
     scale: str
     inputs: tuple[Path, ...]  # what a record lists: pictures, and take.json where one was read
+    notes: tuple[str, ...] = ()  # what the metadata say against themselves, a sentence each
 
     @property
     def paths(self) -> list[Path]:
         """The pictures in order."""
         return [frame.path for frame in self.frames]
 
+    @property
+    def raw(self) -> bool:
+        """Whether all pictures are camera RAW, see :func:`mosaics`."""
+        return all(path.suffix.lower() in RAW_SUFFIXES for path in self.paths)
+
 
 @dataclass(frozen=True)
 class Picture:
-    """A frame's pixels, (H, W, C) with C of 1 or 3; `linear` if proportional to exposure."""
+    """A frame's pixels, (H, W, C) with C of 1 or 3; `linear` if proportional to exposure.
+
+    `white`, if known, is the value of saturated pixels in all channels: in RAW pictures, where
+    it lies above all others.
+    """
 
     path: Path
     pixels: NDArray[Any]
     channels: tuple[str, ...]
     linear: bool
+    white: float | None = None
 
 
 def read_bracket(
-    inputs: Sequence[str | os.PathLike[str]], times: Sequence[float] | None = None
+    inputs: Sequence[str | os.PathLike[str]],
+    times: Sequence[float] | None = None,
+    nd: Sequence[float] = (),
 ) -> Bracket:
     """Gather frames from pictures, take folders and ``take.json`` files.
 
-    `times` (seconds, one a picture) override those of takes and metadata.
+    `times` (seconds, one a picture) override those of takes and metadata. `nd` are the stops of
+    neutral-density filters, one for all pictures or one a picture; none where it is empty.
 
     Raises
     ------
@@ -102,7 +119,15 @@ def read_bracket(
                 raise UserError(f"exposure time {time} is not a positive number of seconds")
         frames = [replace(f, time=float(t)) for f, t in zip(frames, times, strict=True)]
     exposures, scale = _exposures(frames)
-    return Bracket(tuple(frames), exposures, scale, (*files, *(frame.path for frame in frames)))
+    if nd:
+        exposures, scale = exposures * transmissions(nd, len(frames)), f"{scale} * ND"
+    return Bracket(
+        tuple(frames),
+        exposures,
+        scale,
+        (*files, *(frame.path for frame in frames)),
+        tuple(f"{f.path.name}: {said}" for f in frames for said in contradictions(f.path)),
+    )
 
 
 def _photograph(path: Path, seen: Exposure, *, timed: bool) -> Frame:
@@ -156,6 +181,34 @@ def pictures(bracket: Bracket, tell: Callable[[str], None]) -> Iterator[Picture]
             yield picture
 
 
+def mosaics(bracket: Bracket, tell: Callable[[str], None]) -> Iterator[Mosaic]:
+    """Read the frames of a RAW bracket as sensor values, in order.
+
+    Raises
+    ------
+    UserError
+        A picture that is no Bayer mosaic, or of another size, pattern or camera than the first.
+
+    """
+    first: Mosaic | None = None
+    for number, path in enumerate(bracket.paths):
+        mosaic = read_mosaic(path)
+        first = first or mosaic
+        for what, mine, its in (
+            ("size", mosaic.pixels.shape[::-1], first.pixels.shape[::-1]),
+            ("colour pattern", mosaic.pattern, first.pattern),
+            ("camera", mosaic.exposure.camera, first.exposure.camera),
+        ):
+            if mine != its:
+                raise UserError(
+                    f"its {what} is {mine}, that of {bracket.paths[0].name} is {its}: a RAW "
+                    "bracket comes from one camera",
+                    file=path,
+                )
+        tell(f"{number + 1}/{len(bracket.paths)} {path.name}")
+        yield mosaic
+
+
 def _read(path: Path) -> Picture:
     image = read_image(path)
     names = [name.upper() for name in image.channels]
@@ -173,6 +226,10 @@ def _read(path: Path) -> Picture:
                 f"channels {', '.join(image.channels)}: neither RGB nor grey", file=path
             )
     pixels = np.ascontiguousarray(pixels)
+    if image.saturated is not None and image.white is not None:
+        # so that values tell: negative ones are noise, of the saturated colour nothing is known
+        pixels = np.clip(pixels, 0, np.float32(0.98 * image.white))
+        pixels[image.saturated] = image.white
     if pixels.dtype == np.float32:
         bad = ~np.isfinite(pixels) | (pixels < 0)
         if bad.any():
@@ -182,7 +239,7 @@ def _read(path: Path) -> Picture:
                 f"at x {x}, y {y}",
                 file=path,
             )
-    return Picture(path, pixels, tuple(chosen), image.linear)
+    return Picture(path, pixels, tuple(chosen), image.linear, image.white)
 
 
 def _fits(first: Picture, picture: Picture) -> None:

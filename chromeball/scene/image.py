@@ -153,8 +153,8 @@ def read_header(path: str | os.PathLike[str]) -> Header:
     if path.suffix.lower() in RAW_SUFFIXES:
         from chromeball.scene.raw import raw_header
 
-        size, exposure = raw_header(path)
-        return Header(size, ("R", "G", "B"), exposure, {})
+        size, exposure, attributes = raw_header(path)
+        return Header(size, ("R", "G", "B"), exposure, attributes)
     import OpenImageIO as oiio
 
     source = oiio.ImageInput.open(os.fspath(path))
