@@ -69,7 +69,10 @@ def write_dng(
     white: int | None = None,
     more: Sequence[Field] = (),
 ) -> None:
-    """Write `codes` (H, W) as DNG; `white` is the metadata's, the sensor's own by default."""
+    """Write `codes` (H, W) as DNG.
+
+    `white` is the metadata's, the sensor's own by default; `more` adds or replaces tags.
+    """
     height, width = codes.shape
     exif: list[Field] = []
     if time is not None:
@@ -103,12 +106,13 @@ def write_dng(
         (50714, _LONG, sensor.black),
         (50717, _LONG, [sensor.white if white is None else white]),
         (50728, _RATIONAL, sensor.neutral),
-        *more,
     ]
     if matrix is not None:
         fields += [(50721, _SRATIONAL, np.ravel(matrix).tolist()), (50778, _SHORT, [21])]
     if noise_profile:
         fields.append((51041, _DOUBLE, [*sensor.noise] * 3))
+    given = {field[0] for field in more}
+    fields = [*(field for field in fields if field[0] not in given), *more]
     # a directory's size does not depend on the offsets in it
     size = len(_directory([*fields, (34665, _LONG, [0]), (273, _LONG, [0])], 8))
     second = _directory(exif, 8 + size)

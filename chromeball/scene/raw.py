@@ -357,7 +357,10 @@ def open_raw(path: Path) -> Generator[Any]:
 
 def _no_bayer(raw: Any) -> str | None:
     """Why a picture cannot be read as a Bayer mosaic; None where it can."""
-    pattern = raw.raw_pattern
+    try:
+        pattern = raw.raw_pattern
+    except NotImplementedError:  # rawpy knows patterns of 2 x 2 and 6 x 6
+        return "its colours repeat in neither 2 x 2 nor 6 x 6 pixels"
     if pattern is None or raw.raw_image_visible.ndim != 2:
         return "its pixels hold all colours (linear DNG, Foveon)"
     if pattern.shape != (2, 2):
