@@ -352,7 +352,7 @@ def test_levels_that_make_no_sense_are_refused(tmp_path: Path) -> None:
 def test_other_patterns_are_left_to_libraw(tmp_path: Path) -> None:
     rows = ["GBGGRG", "RGRBGB", "GBGGRG", "GRGGBG", "BGBRGR", "GRGGBG"]
     pattern = bytes("RGB".index(letter) for row in rows for letter in row)
-    letters = np.tile(np.frombuffer(pattern, np.uint8).reshape(6, 6), (16, 16))
+    letters = np.tile(np.frombuffer(pattern, np.uint8).reshape(6, 6), (90, 90))
     neutral = np.array(Sensor().neutral)
     codes = (512 + 0.5 * (15000 - 512) * neutral[letters]).round().astype(np.uint16)
     codes[40:60, 40:60] = 15000
