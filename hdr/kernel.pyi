@@ -3,19 +3,31 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-def patches(image: NDArray[np.uint8], size: int, spread: int) -> NDArray[np.uint16]: ...
-def shares(
-    frames: Sequence[NDArray[np.uint16]], weights: NDArray[np.float64]
-) -> NDArray[np.float32]: ...
-def accumulate(
+def patches(
+    image: NDArray[np.uint8] | NDArray[np.uint16],
+    knot: NDArray[np.uint16],
+    size: int,
+    spread: int,
+) -> NDArray[np.uint16]: ...
+def unchanging(
+    frames: Sequence[NDArray[np.uint16]], least: float, bright: float
+) -> NDArray[np.uint8]: ...
+def comparagrams(
     frames: Sequence[NDArray[np.uint16]],
-    weights: NDArray[np.float64],
-    share: NDArray[np.float32],
+    pairs: Sequence[tuple[int, int]],
+    skip: NDArray[np.uint8],
+) -> NDArray[np.float32]: ...
+def ridges(
+    frames: Sequence[NDArray[np.uint16]],
+    pairs: Sequence[tuple[int, int]],
+    skip: NDArray[np.uint8],
+) -> NDArray[np.float64]: ...
+def accumulate(
+    frames: Sequence[NDArray[np.uint16]], weights: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]: ...
 def residuals(
     frames: Sequence[NDArray[np.uint16]],
     weights: NDArray[np.float64],
-    share: NDArray[np.float32],
     g: NDArray[np.float64],
     tau: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]: ...

@@ -1,11 +1,14 @@
 // Joint statistics of code tuples, for the response solvers; numpy references in tests/hdr.
 
+#include <oneapi/tbb/blocked_range.h>
 #include <oneapi/tbb/parallel_for.h>
 
 #include <algorithm>
+#include <atomic>
 #include <cmath>
 #include <cstdint>
 #include <utility>
+#include <vector>
 
 #include "kernel.h"
 
@@ -13,40 +16,101 @@ namespace {
 
 constexpr std::size_t slices = 4;  // fixed, so that sums do not depend on the thread count
 
-// Codes as 8.8 fixed point: patch means fall between two codes. No 8-bit mean reaches this.
+// Knots as 8.8 fixed point: codes and patch means fall between two of the 256 knots of a curve.
+// No usable value reaches this.
 constexpr std::uint16_t unusable = 0xffff;
 
-// Mean codes of size x size patches, (pixels, channels) of the picture row by row; a patch is
-// unusable in a frame where a pixel of it is clipped (the mean would be biased) or where its
-// codes spread over more than `spread` (an edge: the response is not linear across it).
-nb::object patches(nb::ndarray<const std::uint8_t, nb::ndim<3>, nb::c_contig, nb::device::cpu> image,
+// Mean knot coordinates of size x size patches, (patches, channels), row by row; `knot` maps a
+// code to its coordinate (for 8 bits they are the same). A patch is unusable in a frame where a pixel of it is saturated (the
+// mean would be biased) or where it spreads over more than `spread` (an edge: the response is
+// not linear across it); one that is black throughout stays, as zero.
+template <typename T>
+nb::object patches(nb::ndarray<const T, nb::ndim<3>, nb::c_contig, nb::device::cpu> image,
+                   nb::ndarray<const std::uint16_t, nb::ndim<1>, nb::c_contig, nb::device::cpu> knot,
                    std::size_t size, int spread) {
   const std::size_t rows = image.shape(0) / size, columns = image.shape(1) / size;
-  const std::size_t C = image.shape(2), stride = image.shape(1) * C;
+  const std::size_t C = image.shape(2), stride = image.shape(1) * C, n = size * size;
+  const std::uint32_t saturated = knot(knot.shape(0) - 1);
+  const std::uint32_t wide = static_cast<std::uint32_t>(spread) * 256;
+  const std::uint16_t* coordinate = knot.data();
+  const std::size_t known = knot.shape(0);
   auto mean = std::make_unique<std::uint16_t[]>(rows * columns * C);
+  std::atomic<bool> outside = false;
   {
     nb::gil_scoped_release release;
-    tbb::parallel_for(std::size_t{0}, rows, [&](std::size_t row) {
-      for (std::size_t column = 0; column < columns; ++column)
-        for (std::size_t c = 0; c < C; ++c) {
-          const std::uint8_t* corner = image.data() + row * size * stride + column * size * C + c;
-          std::uint32_t sum = 0;
-          int low = 255, high = 0;
-          for (std::size_t y = 0; y < size; ++y)
-            for (std::size_t x = 0; x < size; ++x) {
-              const int z = corner[y * stride + x * C];
-              sum += static_cast<std::uint32_t>(z);
-              low = std::min(low, z);
-              high = std::max(high, z);
+    tbb::parallel_for(tbb::blocked_range<std::size_t>(0, rows, 16), [&](const auto& range) {
+      const std::size_t width = columns * size * C;
+      std::vector<std::uint32_t> sum(width), low(width), high(width);
+      bool beyond = false;
+      for (std::size_t row = range.begin(); row < range.end(); ++row) {
+        std::fill(sum.begin(), sum.end(), 0u);
+        std::fill(low.begin(), low.end(), ~0u);
+        std::fill(high.begin(), high.end(), 0u);
+        for (std::size_t y = 0; y < size; ++y) {
+          const T* line = image.data() + (row * size + y) * stride;
+          for (std::size_t x = 0; x < width; ++x) {
+            const std::size_t z = line[x];
+            std::uint32_t k;
+            if constexpr (sizeof(T) == 1) {  // 256 codes: the codes are the knots
+              k = static_cast<std::uint32_t>(z) << 8;
+            } else {
+              beyond = beyond || z >= known;
+              k = coordinate[std::min(z, known - 1)];
             }
-          const std::uint32_t n = static_cast<std::uint32_t>(size * size);
-          const bool usable = low > 0 && high < 255 && high - low <= spread;
-          mean[(row * columns + column) * C + c] =
-              usable ? static_cast<std::uint16_t>((std::uint64_t{sum} * 256 + n / 2) / n) : unusable;
+            sum[x] += k;
+            low[x] = std::min(low[x], k);
+            high[x] = std::max(high[x], k);
+          }
         }
+        std::uint16_t* out = mean.get() + row * columns * C;
+        for (std::size_t column = 0; column < columns; ++column)
+          for (std::size_t c = 0; c < C; ++c) {
+            const std::size_t first = column * size * C + c;
+            std::uint32_t total = 0, least = ~0u, most = 0;
+            for (std::size_t x = 0; x < size; ++x) {
+              total += sum[first + x * C];
+              least = std::min(least, low[first + x * C]);
+              most = std::max(most, high[first + x * C]);
+            }
+            const bool usable = most < saturated && most - least <= wide;
+            out[column * C + c] =
+                usable ? static_cast<std::uint16_t>((total + n / 2) / n) : unusable;
+          }
+      }
+      if (beyond) outside = true;
     });
   }
+  if (outside) throw std::invalid_argument("a code beyond the table");
   return to_numpy(std::move(mean), {rows * columns, C});
+}
+
+// Marks what no light changes: patches whose knots stay within `least` of each other in all
+// frames although the brightest of them is `bright` or more (borders, watermarks, captions).
+nb::object unchanging(const std::vector<Frame<std::uint16_t>>& frames, double least, double bright) {
+  const Stack<std::uint16_t> stack(frames);
+  const std::size_t C = stack.channels;
+  const int span = static_cast<int>(least * 256), floor = static_cast<int>(bright * 256);
+  auto still = std::make_unique<std::uint8_t[]>(stack.pixels);
+  {
+    nb::gil_scoped_release release;
+    tbb::parallel_for(tbb::blocked_range<std::size_t>(0, stack.pixels, 4096), [&](const auto& range) {
+      for (std::size_t i = range.begin(); i < range.end(); ++i) {
+        bool same = true, shown = false;
+        for (std::size_t c = 0; c < C && same; ++c) {
+          int low = 0xffff, high = 0;
+          for (const std::uint16_t* frame : stack.data) {
+            const int k = frame[i * C + c];
+            low = std::min(low, k);
+            high = std::max(high, k);
+          }
+          same = high - low <= span;
+          shown = shown || (high >= floor && high != unusable);
+        }
+        still[i] = same && shown;
+      }
+    });
+  }
+  return to_numpy(std::move(still), {stack.pixels});
 }
 
 // One usable observation of a pixel: code z + u, so g = (1 - u) g(z) + u g(z + 1).
@@ -62,8 +126,7 @@ double along(const double* table, const Observation& o) {
 // Calls body(observations, count, sum of weights) for each pixel of one slice of one channel
 // that at least two frames measure.
 template <typename Body>
-void each_pixel(const Stack<std::uint16_t>& stack, const double* weights, const float* share,
-                std::size_t channel, std::size_t slice, Body&& body) {
+void each_pixel(const Stack<std::uint16_t>& stack, const double* weights, std::size_t channel, std::size_t slice, Body&& body) {
   std::vector<Observation> seen(stack.frames());
   const std::size_t first = stack.pixels * slice / slices;
   const std::size_t last = stack.pixels * (slice + 1) / slices;
@@ -72,9 +135,9 @@ void each_pixel(const Stack<std::uint16_t>& stack, const double* weights, const 
     double total = 0;
     for (std::size_t j = 0; j < stack.frames(); ++j) {
       const std::uint16_t code = stack.data[j][i * stack.channels + channel];
-      if (code >= 255 * 256) continue;  // unusable, or at the end of the range
+      if (code >= (codes - 1) * 256) continue;  // unusable, or at the end of the range
       Observation o{j, static_cast<std::size_t>(code >> 8), (code & 255) / 256.0, 0};
-      o.weight = along(weights, o) * static_cast<double>(share[i * stack.channels + channel]);
+      o.weight = along(weights, o);
       if (!(o.weight > 0)) continue;
       total += o.weight;
       seen[count++] = o;
@@ -93,57 +156,13 @@ void add_outer(double* matrix, const Observation& a, const Observation& b, doubl
   row[codes + 1] += high * b.u;
 }
 
-// What each pixel counts for: 1 / (its mean code density), mean over its frames weighted by W.
-// Every brightness then counts alike; with plain counts, noise pulls each code's estimate down
-// the slope of the histogram, and no number of pixels mends that.
-nb::object shares(const std::vector<Frame<std::uint16_t>>& frames, Table1 weights) {
-  const Stack<std::uint16_t> stack(frames);
-  check_table(weights.shape(0));
-  const std::size_t P = stack.frames(), C = stack.channels;
-  auto share = std::make_unique<float[]>(stack.pixels * C);
-  {
-    nb::gil_scoped_release release;
-    tbb::parallel_for(std::size_t{0}, C, [&](std::size_t c) {
-      constexpr std::size_t reach = 2;  // the density is a mean over 5 codes
-      std::vector<float> density(P * codes, 0);
-      for (std::size_t j = 0; j < P; ++j) {
-        std::vector<float> histogram(codes, 0);
-        for (std::size_t i = 0; i < stack.pixels; ++i) {
-          const std::uint16_t code = stack.data[j][i * C + c];
-          if (code < 255 * 256) ++histogram[code >> 8];
-        }
-        for (std::size_t z = 0; z < codes; ++z) {
-          const std::size_t first = z < reach ? 0 : z - reach;
-          const std::size_t last = std::min(codes - 1, z + reach);
-          for (std::size_t y = first; y <= last; ++y) density[j * codes + z] += histogram[y];
-          density[j * codes + z] /= static_cast<float>(last - first + 1);
-        }
-      }
-      for (std::size_t i = 0; i < stack.pixels; ++i) {
-        float sum = 0, total = 0;
-        for (std::size_t j = 0; j < P; ++j) {
-          const std::uint16_t code = stack.data[j][i * C + c];
-          if (code >= 255 * 256) continue;
-          const float w = static_cast<float>(weights(code >> 8));
-          sum += w * density[j * codes + (code >> 8)];
-          total += w;
-        }
-        share[i * C + c] = sum > 0 ? total / sum : 0;
-      }
-    });
-  }
-  return to_numpy(std::move(share), {stack.pixels, C});
-}
-
 // The quadratic form of sum_ij W_ij (g(z_ij) - ln E_i - tau_j)^2 with every ln E_i eliminated
 // (its Schur complement), over the unknowns (g(0) .. g(255), tau_0 .. tau_{P-1}):
 //   H = sum_i [ sum_j W_j f_j f_j' - (sum_j W_j f_j)(sum_j W_j f_j)' / sum_j W_j ],
 //   f_j = e(z_j) - e(256 + j).
-nb::tuple accumulate(const std::vector<Frame<std::uint16_t>>& frames, Table1 weights, Shares share) {
+nb::tuple accumulate(const std::vector<Frame<std::uint16_t>>& frames, Table1 weights) {
   const Stack<std::uint16_t> stack(frames);
   check_table(weights.shape(0));
-  if (share.shape(0) != stack.pixels || share.shape(1) != stack.channels)
-    throw std::invalid_argument("shares do not match the frames");
   const std::size_t P = stack.frames(), C = stack.channels, n = codes + P;
   auto H = std::make_unique<double[]>(C * n * n);
   auto seen = std::make_unique<double[]>(C * codes);
@@ -162,7 +181,7 @@ nb::tuple accumulate(const std::vector<Frame<std::uint16_t>>& frames, Table1 wei
       part.tt.assign(P * P, 0);
       part.seen.assign(codes, 0);
       std::vector<double> row(P);
-      each_pixel(stack, weights.data(), share.data(), task / slices, task % slices,
+      each_pixel(stack, weights.data(), task / slices, task % slices,
                  [&](const Observation* o, std::size_t count, double total) {
         ++part.used;
         for (std::size_t a = 0; a < count; ++a) {
@@ -216,13 +235,11 @@ nb::tuple accumulate(const std::vector<Frame<std::uint16_t>>& frames, Table1 wei
 // score  = sum_i s_i s_i', s_i = sum_j W_j e_j f_j     (the middle of a sandwich covariance),
 // within = sum over the observations of code z of W_j e_j^2,
 // freedom = the same sum of W_j - W_j^2 / sum W        (its expectation at unit variance).
-nb::tuple residuals(const std::vector<Frame<std::uint16_t>>& frames, Table1 weights, Shares share,
+nb::tuple residuals(const std::vector<Frame<std::uint16_t>>& frames, Table1 weights,
                     Table2 g, Table1 tau) {
   const Stack<std::uint16_t> stack(frames);
   const std::size_t C = stack.channels;
   check_table(weights.shape(0));
-  if (share.shape(0) != stack.pixels || share.shape(1) != stack.channels)
-    throw std::invalid_argument("shares do not match the frames");
   check_table(g.shape(1));
   if (g.shape(0) != C || tau.shape(0) != stack.frames())
     throw std::invalid_argument("curves or times do not match the frames");
@@ -242,7 +259,7 @@ nb::tuple residuals(const std::vector<Frame<std::uint16_t>>& frames, Table1 weig
       part.freedom.assign(codes, 0);
       std::vector<double> s(stack.frames());
       const double* curve = g.data() + task / slices * codes;
-      each_pixel(stack, weights.data(), share.data(), task / slices, task % slices,
+      each_pixel(stack, weights.data(), task / slices, task % slices,
                  [&](const Observation* o, std::size_t count, double total) {
         double mean = 0;
         for (std::size_t a = 0; a < count; ++a)
@@ -276,12 +293,97 @@ nb::tuple residuals(const std::vector<Frame<std::uint16_t>>& frames, Table1 weig
                         to_numpy(std::move(freedom), {C, codes}));
 }
 
+using Pairs = std::vector<std::pair<std::size_t, std::size_t>>;
+using Marks = nb::ndarray<const std::uint8_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+
+constexpr double whole = 65536;  // what one patch adds to a joint histogram, all cells together
+
+// Calls body(pair * C + channel, sums) for the joint histogram sums[a * 256 + b] of each pair
+// and channel. Codes between two whole ones are split bilinearly over the four cells; patches
+// that are marked in `skip` do not count.
+template <typename Body>
+void each_comparagram(const Stack<std::uint16_t>& stack, const Pairs& pairs, const Marks& skip,
+                      Body&& body) {
+  if (skip.shape(0) != stack.pixels) throw std::invalid_argument("marks do not match the frames");
+  for (const auto& [a, b] : pairs)
+    if (a >= stack.frames() || b >= stack.frames()) throw std::invalid_argument("no such frame");
+  const std::size_t C = stack.channels;
+  const std::uint8_t* skipped = skip.data();
+  nb::gil_scoped_release release;
+  tbb::parallel_for(std::size_t{0}, pairs.size() * C, [&](std::size_t task) {
+    const std::uint16_t* first = stack.data[pairs[task / C].first] + task % C;
+    const std::uint16_t* second = stack.data[pairs[task / C].second] + task % C;
+    std::vector<std::uint64_t> sum((codes + 1) * codes, 0);
+    for (std::size_t i = 0; i < stack.pixels; ++i) {
+      const std::uint32_t za = first[i * C], zb = second[i * C];
+      if (za == unusable || zb == unusable || skipped[i]) continue;
+      const std::uint32_t u = za & 255, v = zb & 255;
+      std::uint64_t* cell = sum.data() + (za >> 8) * codes + (zb >> 8);
+      cell[0] += (256 - u) * (256 - v);
+      if (v) cell[1] += (256 - u) * v;
+      if (u) {
+        cell[codes] += u * (256 - v);
+        if (v) cell[codes + 1] += u * v;
+      }
+    }
+    body(task, sum.data());
+  });
+}
+
+// Comparagrams C[pair, channel, a, b]: how many patches show a in the first frame of a pair and
+// b in the second.
+nb::object comparagrams(const std::vector<Frame<std::uint16_t>>& frames, const Pairs& pairs,
+                        const Marks& skip) {
+  const Stack<std::uint16_t> stack(frames);
+  constexpr std::size_t cells = codes * codes;
+  auto counts = std::make_unique<float[]>(pairs.size() * stack.channels * cells);
+  each_comparagram(stack, pairs, skip, [&](std::size_t task, const std::uint64_t* sum) {
+    for (std::size_t j = 0; j < cells; ++j)
+      counts[task * cells + j] = static_cast<float>(static_cast<double>(sum[j]) / whole);
+  });
+  return to_numpy(std::move(counts), {pairs.size(), stack.channels, codes, codes});
+}
+
+// Ridges of the comparagrams, (pairs, channels, 4, 256): for each b how many patches show it in
+// the second frame of a pair, and the three quartiles of what they show in the first. A cell
+// spreads evenly over a - 1/2 .. a + 1/2.
+nb::object ridges(const std::vector<Frame<std::uint16_t>>& frames, const Pairs& pairs,
+                  const Marks& skip) {
+  const Stack<std::uint16_t> stack(frames);
+  auto found = std::make_unique<double[]>(pairs.size() * stack.channels * 4 * codes);
+  each_comparagram(stack, pairs, skip, [&](std::size_t task, const std::uint64_t* sum) {
+    double* row = found.get() + task * 4 * codes;
+    std::vector<std::uint64_t> total(codes, 0), below(codes, 0);
+    for (std::size_t a = 0; a < codes; ++a)
+      for (std::size_t b = 0; b < codes; ++b) total[b] += sum[a * codes + b];
+    for (std::size_t b = 0; b < codes; ++b) row[b] = static_cast<double>(total[b]) / whole;
+    for (std::size_t a = 0; a < codes; ++a)
+      for (std::size_t b = 0; b < codes; ++b) {
+        const std::uint64_t here = sum[a * codes + b];
+        if (here == 0) continue;
+        for (std::size_t q = 1; q <= 3; ++q) {
+          const double wanted = 0.25 * static_cast<double>(q * total[b]);
+          const double start = static_cast<double>(below[b]);
+          if (start < wanted && wanted <= start + static_cast<double>(here))
+            row[q * codes + b] =
+                static_cast<double>(a) - 0.5 + (wanted - start) / static_cast<double>(here);
+        }
+        below[b] += here;
+      }
+  });
+  return to_numpy(std::move(found), {pairs.size(), stack.channels, 4, codes});
+}
+
 }  // namespace
 
 void bind_response(nb::module_& m) {
-  m.def("patches", &patches, nb::arg("image"), nb::arg("size"), nb::arg("spread"));
-  m.def("shares", &shares, nb::arg("frames"), nb::arg("weights"));
-  m.def("accumulate", &accumulate, nb::arg("frames"), nb::arg("weights"), nb::arg("share"));
-  m.def("residuals", &residuals, nb::arg("frames"), nb::arg("weights"), nb::arg("share"), nb::arg("g"),
-        nb::arg("tau"));
+  m.def("patches", &patches<std::uint8_t>, nb::arg("image"), nb::arg("knot"), nb::arg("size"),
+        nb::arg("spread"));
+  m.def("patches", &patches<std::uint16_t>, nb::arg("image"), nb::arg("knot"), nb::arg("size"),
+        nb::arg("spread"));
+  m.def("unchanging", &unchanging, nb::arg("frames"), nb::arg("least"), nb::arg("bright"));
+  m.def("ridges", &ridges, nb::arg("frames"), nb::arg("pairs"), nb::arg("skip"));
+  m.def("comparagrams", &comparagrams, nb::arg("frames"), nb::arg("pairs"), nb::arg("skip"));
+  m.def("accumulate", &accumulate, nb::arg("frames"), nb::arg("weights"));
+  m.def("residuals", &residuals, nb::arg("frames"), nb::arg("weights"), nb::arg("g"), nb::arg("tau"));
 }

@@ -1,70 +1,77 @@
-"""The response curve of a camera from a bracket (Debevec and Malik 1997; row P12).
+"""The response curve of a camera from a bracket (row P12): what goes in, what comes out.
 
-Minimise over g, per channel, with every ln E_i eliminated,
-
-    sum_ij { w(Z_ij) [ g(Z_ij) - ln E_i - ln dt_j ] }^2 + lambda sum_z [ w(z) g''(z) ]^2,
-
-g''(z) = g(z-1) - 2 g(z) + g(z+1) for z = Zmin+1 .. Zmax-1, w the hat, g((Zmin+Zmax)/2) = 0.
-The kernel sums the Schur complement over all pixels; what is left has the size of the code
-range. Three things differ from the paper, all about noise:
-
-- Z_ij is the mean code of a small patch (2 x 2 pixels; larger for large pictures) and may fall
-  between two codes, where g is linear. Patches with an edge or a clipped pixel are left out.
-- Each patch counts by the inverse of its code density, so that every brightness counts alike:
-  with plain counts noise pulls each code down the slope of the histogram, whatever N is.
-- The data are scaled to one observation a code: s = sum_z w(z)^2 / trace(H_gg). So lambda means
-  the same for a thumbnail and for 21 megapixels.
-
-Unknowns are few and the matrix is badly conditioned (1e5 - 1e9): float64 throughout.
+Two solvers: the comparagram solve with a prior over real curves
+(:mod:`chromeball.hdr.comparagram`), the default, and Debevec and Malik's
+(:mod:`chromeball.hdr.debevec`), exactly as published. Exposures are checked on the way: one
+that contradicts the pictures is found, named and replaced by what they show, and nominal times
+are refined where that explains the pictures better.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cache
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import isotonic_regression
 
-from chromeball.hdr import kernel
+from chromeball.hdr import comparagram, debevec, kernel
+from chromeball.hdr.comparagram import Rows
+from chromeball.hdr.knots import (
+    KNOTS,
+    MIDDLE,
+    as_codes,
+    at_codes,
+    at_knots,
+    codes_at_knots,
+    fixed_point,
+)
+from chromeball.hdr.prior import Prior, known_cameras
+from chromeball.hdr.response_file import Exposed, Response
 from chromeball.scene.errors import UserError
 
-CODES = 256
-MIDDLE = CODES // 2
-#: lambda: of 3 .. 300 the best over 15 DoRF curves x 5 radiance maps, 7 x 1 EV and 5 x 2 EV
-SMOOTHNESS = 30.0
-#: codes over which a patch may spread
+type Float = NDArray[np.float64]
+type Method = Literal["comparagram", "debevec"]
+
+#: knots over which a patch may spread
 SPREAD = 16
 #: patches are made larger until there are no more than this
 MOST_PATCHES = 1_200_000
-#: the least rise of g from one code to the next
+#: the least rise of g from one knot to the next
 LEAST_STEP = 1e-4
-
-type Float = NDArray[np.float64]
-
-
-def hat(codes: int = CODES) -> Float:
-    """w(z) = z - Zmin below the middle, Zmax - z above it; shape (codes,)."""
-    z = np.arange(codes, dtype=np.float64)
-    return np.minimum(z, codes - 1 - z)
+#: standard deviation of nominal times, in ln units
+NOMINAL = 0.1
+#: log evidence that speaks for other exposures than those given
+DECISIVE = 10.0
+#: a single exposure off by more than this (ln units) is an error, not a rounding
+WRONG = 0.2
+#: knots by which a patch must change to be light, and how bright it must be to tell
+UNCHANGING, BRIGHT_ENOUGH = 3.0, 24.0
+#: knots that rows must tell of
+FEWEST_KNOTS = 12
 
 
 @dataclass(frozen=True)
 class Sample:
-    """What one frame gives: mean codes of its patches, and single pixels for the noise."""
+    """What one frame gives: knots of its patches, and single pixels for the noise."""
 
     patches: NDArray[np.uint16]  # (N, C), 8.8 fixed point, 0xffff where unusable
     pixels: NDArray[np.uint16]  # (n, C), likewise
     patch: int
+    codes: int
     dark: float  # share of values at the lowest code
     bright: float  # share at the highest
 
 
-def sample(frame: NDArray[np.uint8], patch: int | None = None) -> Sample:
-    """Reduce a frame (H, W, C) uint8 to what the solver needs; `patch` in pixels a side."""
+def sample(frame: NDArray[Any], codes: int = KNOTS, patch: int | None = None) -> Sample:
+    """Reduce a frame (H, W, C), uint8 or uint16, to what the solvers need.
+
+    `patch` in pixels a side; 1 keeps every pixel.
+    """
+    frame = np.ascontiguousarray(as_codes(frame, codes))
     height, width = frame.shape[:2]
     if patch is None:
         least = 2 if height * width >= 40_000 else 1
@@ -73,12 +80,14 @@ def sample(frame: NDArray[np.uint8], patch: int | None = None) -> Sample:
         raise UserError(f"a patch of {patch} pixels does not fit {width} x {height}")
     stride = max(1, int(np.sqrt(height * width / 100_000)))
     lattice = np.ascontiguousarray(frame[::stride, ::stride])
+    knot = fixed_point(codes)
     return Sample(
-        patches=kernel.patches(frame, patch, SPREAD if patch > 1 else CODES),
-        pixels=kernel.patches(lattice, 1, CODES),
+        patches=kernel.patches(frame, knot, patch, SPREAD if patch > 1 else KNOTS),
+        pixels=kernel.patches(lattice, knot, 1, KNOTS),
         patch=patch,
+        codes=codes,
         dark=float(np.mean(lattice == 0)),
-        bright=float(np.mean(lattice == CODES - 1)),
+        bright=float(np.mean(lattice == codes - 1)),
     )
 
 
@@ -86,46 +95,50 @@ def sample(frame: NDArray[np.uint8], patch: int | None = None) -> Sample:
 class Solution:
     """Curves and how good they are.
 
-    ``g`` and ``sigma`` (C, 256): ln exposure of each code and its standard error, noise and
-    smoothing bias together (see :func:`solve`). ``log_exposures`` (P,): as given, or refined.
-    ``rms`` (C,): weighted residual in ln units. ``code_noise`` (C,): standard deviation of a
-    pixel in codes. ``observed`` (C, 256): patches that showed a code. ``repaired`` (C,): codes
-    that were moved to make a curve rise. ``condition`` (C,): of the matrix solved, its
-    diagonal scaled to one.
+    ``g`` and ``sigma`` (C, codes): ln exposure of each code, zero at the middle one, and its
+    standard error. ``log_exposures`` (P,): as given, corrected, or refined. ``rms`` and
+    ``rms_nominal`` (C,): residual in ln units, of the equations solved. ``chi_square`` (C,):
+    of the same over its expectation. ``code_noise`` (C, codes): standard deviation of a pixel
+    in codes. ``observed`` (C, 256): patches that tell of a knot. ``repaired`` (C,): knots that
+    were moved to make a curve rise. ``condition`` (C,): of the matrix solved. ``wrong``: frames
+    whose exposure contradicts the pictures, with the factor to what was given. ``unchanging``:
+    share of patches that no exposure changes. ``extra``: figures of the one method.
     """
 
+    method: Method
     g: Float
     sigma: Float
     log_exposures: Float
     rms: Float
+    rms_nominal: Float
+    chi_square: Float
     code_noise: Float
     observed: Float
     used: NDArray[np.int64]
     repaired: NDArray[np.int64]
     condition: Float
     patch: int
-    smoothness: float
     refined: bool
-    rms_nominal: Float
+    wrong: tuple[tuple[int, float], ...]
+    unchanging: float
+    extra: dict[str, Any]
 
 
 def solve(
     samples: Sequence[Sample],
     exposures: Float,
     *,
-    smoothness: float = SMOOTHNESS,
-    refine_times: bool = False,
+    method: Method = "comparagram",
+    prior: Prior | None = None,
+    smoothness: float = debevec.SMOOTHNESS,
+    refine_times: bool | None = None,
 ) -> Solution:
     """Solve for the response of every channel.
 
     `exposures` (P,) are relative and positive. With `refine_times` the log exposures are
-    unknowns too, shared by the channels; see :func:`refine`.
-
-    The variance of g is the diagonal of ``s^2 M^-1 B M^-1``, M = s H + lambda D'D, B the
-    scatter of the patches' scores (a sandwich, so unequal noise is allowed for), plus what
-    smoothing bends, ``lambda M^-1 D' c`` for c = w g'': once for c of random sign and the mean
-    square found, once for the largest c found, everywhere of one sign. The bias that noise
-    itself leaves (it shrinks with the patch) is not in it.
+    unknowns too, shared by the channels, their span kept; ``None`` refines them where the
+    pictures say so decisively (comparagrams only). `prior` is that of known cameras unless
+    given; `smoothness` is Debevec and Malik's lambda.
 
     Raises
     ------
@@ -133,102 +146,272 @@ def solve(
         When the bracket cannot determine a curve; the message says why.
 
     """
-    log_exposures = np.log(exposures)
+    order = np.argsort(exposures, kind="stable")
+    samples = [samples[k] for k in order]
+    log_exposures = np.log(exposures[order])
     _refuse(samples, log_exposures, smoothness)
-    w = hat()
-    codes = [frame.patches for frame in samples]
-    share = kernel.shares(codes, w**2)
-    H, observed, used = kernel.accumulate(codes, w**2, share)
-    _refuse_few(samples, used, observed)
-    observed_weight = np.trace(H[:, :CODES, :CODES], axis1=1, axis2=2)
-    s = np.sum(w**2) / np.where(observed_weight > 0, observed_weight, np.inf)
-
-    D = second_difference(w)
-
-    def fit(tau: Float) -> tuple[Float, Float, Float, Float]:
-        g, inverse, condition = _solve(H, s, tau, smoothness)
-        B, within, freedom = kernel.residuals(codes, w**2, share, g, tau)
-        half = s[:, None, None] * inverse
-        noise = np.einsum("cij,cjk,cik->ci", half, B, half, optimize=True)
-        curvature = np.abs(w[1:-1] * np.diff(g, 2)) * (observed[:, 1:-1] > 0)
-        bend = smoothness * (inverse @ D.T)
-        ripple = np.mean(curvature**2, axis=1)[:, None] * np.sum(bend**2, axis=2)
-        sag = curvature.max(axis=1)[:, None] * bend.sum(axis=2)
-        sigma = np.sqrt(np.maximum(noise, 0) + ripple + sag**2)
-        return g, sigma, np.sqrt(within.sum(1) / freedom.sum(1)), condition
-
-    g, sigma, rms, condition = fit(log_exposures)
-    rms_nominal = rms
-    if refine_times:
-        log_exposures = refine(H, s, log_exposures, smoothness)
-        g, sigma, rms, condition = fit(log_exposures)
-    rise = g[:, 240] - g[:, 16]
-    if np.any(rise <= 0):
-        raise UserError(
-            "the solved response falls with brightness: the exposure times are in another "
-            "order than the pictures, or the pictures show different scenes"
-        )
-    risen = np.stack([strictly_rising(c, e) for c, e in zip(g, sigma, strict=True)])
-    moved = np.abs(risen - g) > 1e-9
-    risen -= risen[:, MIDDLE, None]
-    return Solution(
-        g=risen,
-        sigma=np.maximum(sigma, np.abs(risen - g)),
-        log_exposures=log_exposures,
-        rms=rms,
-        code_noise=_code_noise(samples, risen, log_exposures),
-        observed=observed,
-        used=used,
-        repaired=moved.sum(axis=1),
-        condition=condition,
-        patch=samples[0].patch,
-        smoothness=smoothness,
-        refined=refine_times,
-        rms_nominal=rms_nominal,
+    if method == "debevec":
+        found = _debevec(samples, log_exposures, smoothness, bool(refine_times))
+    else:
+        found = _comparagram(samples, log_exposures, prior or known_cameras(), refine_times)
+    back = np.argsort(order, kind="stable")
+    return replace(
+        found,
+        log_exposures=found.log_exposures[back],
+        wrong=tuple(sorted((int(order[k]), factor) for k, factor in found.wrong)),
     )
 
 
-def second_difference(w: Float) -> Float:
-    """D with D g = w(z) g''(z) for z = 1 .. n-2; shape (n - 2, n)."""
-    return np.diff(np.eye(len(w)), 2, axis=0) * w[1:-1, None]
+def _comparagram(
+    samples: Sequence[Sample], log_exposures: Float, prior: Prior, refine: bool | None
+) -> Solution:
+    codes = samples[0].codes
+    pairs = comparagram.pair(log_exposures)
+    channels, unchanging = observe([s.patches for s in samples], pairs, log_exposures)
+    _refuse_few(channels, samples)
+    if 2 * np.sum([_brighter(rows) for rows in channels]) < len(channels):
+        _refuse_falling()
+    mean, factors = prior.at(codes)
+    P = len(log_exposures)
+    nominal = log_exposures
+    fit = comparagram.fit(channels, pairs, log_exposures, mean, factors)
+    given = fit.residuals(fit.g, mean, np.zeros(P))
+
+    wrong: dict[int, float] = {}
+    while P >= 3 and len(wrong) < P // 3:
+        k, shift = _worst(fit, exclude=wrong)
+        if k is None:
+            break
+        wrong[k] = shift
+        log_exposures = log_exposures.copy()
+        log_exposures[k] += shift
+        pairs = comparagram.pair(log_exposures)
+        channels, unchanging = observe([s.patches for s in samples], pairs, log_exposures)
+        fit = comparagram.fit(channels, pairs, log_exposures, mean, factors)
+
+    shift = np.zeros(P)
+    if refine is not False and P >= 3:
+        gain, moved = fit.gain(NOMINAL * span_kept(log_exposures, np.diag(fit.S)))
+        if refine or gain > DECISIVE:
+            shift = moved
+    refined = bool(np.any(shift))
+    if refined:
+        log_exposures = log_exposures + shift
+        fit = comparagram.fit(channels, pairs, log_exposures, mean, factors)
+    g = np.stack([darkened(c, rows.darkness, rows.pedestal) for c, rows in zip(fit.g, channels, strict=True)])
+    rise = g[:, 240] - g[:, 16]
+    if np.any(rise <= 0):
+        _refuse_falling()
+    residuals = fit.residuals(fit.g, mean, np.zeros(P))
+    middle = fit.covariance[:, MIDDLE, MIDDLE, None]
+    variance = (
+        np.diagonal(fit.covariance, axis1=1, axis2=2) + middle - 2 * fit.covariance[:, MIDDLE]
+    )
+    chi_square = np.array(
+        [np.mean(r**2 * e.w) for r, e in zip(residuals, fit.equations, strict=True)]
+    )
+    # rows that scatter by more than they should make the curve as much less certain
+    sigma = np.sqrt(np.maximum(variance, 0) * np.maximum(chi_square, 1)[:, None])
+    risen = np.stack([strictly_rising(c, e) for c, e in zip(g, sigma, strict=True)])
+    moved_knots = (np.abs(risen - g) > 1e-9).sum(axis=1)
+    risen -= risen[:, MIDDLE, None]
+    sigma = np.maximum(sigma, np.abs(risen - (g - g[:, MIDDLE, None])))
+    for error, rows in zip(sigma, channels, strict=True):
+        if rows.pedestal > 0:  # darkness tells nothing of exposure
+            error[: int(np.ceil(rows.pedestal))] = np.maximum(
+                error[: int(np.ceil(rows.pedestal))], 1.0
+            )
+    observed = np.stack([_observed(rows) for rows in channels])
+    return Solution(
+        method="comparagram",
+        g=_zeroed(at_codes(risen, codes)),
+        sigma=at_codes(sigma, codes),
+        log_exposures=log_exposures,
+        rms=_rms(residuals),
+        rms_nominal=_rms(given),
+        chi_square=chi_square,
+        code_noise=_code_noise(samples, log_exposures, risen, fit),
+        observed=observed,
+        used=np.array([int(rows.count.sum()) for rows in channels]),
+        repaired=moved_knots,
+        condition=np.array([_condition(e, factors[q]) for e, q in
+                            zip(fit.equations, fit.model, strict=True)]),
+        patch=samples[0].patch,
+        refined=refined,
+        wrong=tuple((k, float(np.exp(v))) for k, v in sorted(wrong.items())),
+        unchanging=unchanging,
+        extra={
+            "roughness": fit.model,
+            "pairs": len(pairs),
+            "darkness": [rows.darkness for rows in channels],
+        },
+    )
 
 
-def roughness(w: Float) -> Float:
-    """R with g' R g = sum over z = 1 .. n-2 of (w(z) g''(z))^2; shape (n, n)."""
-    D = second_difference(w)
-    return D.T @ D
+def observe(
+    frames: Sequence[NDArray[np.uint16]],
+    pairs: Sequence[tuple[int, int]],
+    log_exposures: Float,
+) -> tuple[list[Rows], float]:
+    """Rows of each channel, and the share of patches that no exposure changes."""
+    still = kernel.unchanging(frames, UNCHANGING, BRIGHT_ENOUGH)
+    ridges = kernel.ridges(frames, pairs, still)
+    steps = np.array([log_exposures[j] - log_exposures[i] for i, j in pairs])
+    channels = [comparagram.rows_of(ridges[:, c], steps) for c in range(ridges.shape[1])]
+    return channels, float(still.mean())
 
 
-def refine(H: Float, s: Float, log_exposures: Float, smoothness: float) -> Float:
-    """Log exposures and curves together: g is eliminated, q(tau) = tau' T tau is left.
+def span_kept(log_exposures: Float, observes: Float) -> Float:
+    """Directions (P, P - 2) of shifts that keep mean and span of the log exposures.
 
     A common factor on all exponents cannot be observed (Grossberg and Nayar 2004), nor a
-    common shift. So the mean and the span are kept: the regression of the refined on the given
-    log exposures, each frame weighted by what it observes, has slope 1 and offset 0.
+    common shift: the regression of the refined on the given exposures, each frame weighted by
+    what it observes, has slope 1 and offset 0.
     """
-    P = len(log_exposures)
-    joint = np.zeros((P, P))
-    observes = np.zeros(P)
-    keep = np.arange(CODES) != MIDDLE
-    penalty = smoothness * roughness(hat())[np.ix_(keep, keep)]
-    for h, scale in zip(H, s, strict=True):
-        gg, gt, tt = h[:CODES, :CODES], h[:CODES, CODES:][keep], h[CODES:, CODES:]
-        M = scale * gg[np.ix_(keep, keep)] + penalty
-        joint += scale * tt - scale**2 * gt.T @ np.linalg.solve(M, gt)
-        observes += scale * np.diag(tt)
-    # frames that observe nothing stay where they are
-    stay = 1e-6 * np.trace(joint) / P * np.eye(P)
-    observes /= observes.sum()
-    centred = log_exposures - observes @ log_exposures
-    # tau = given + d, d' A = 0: (T + stay, A; A' 0) (d; multipliers) = (-T given; 0)
-    A = observes[:, None] * np.stack([np.ones(P), centred], axis=1)
-    system = np.block([[joint + stay, A], [A.T, np.zeros((2, 2))]])
-    right = np.concatenate([-joint @ centred, np.zeros(2)])
-    return log_exposures + np.linalg.solve(system, right)[:P]
+    weight = np.maximum(observes, 1e-12 * observes.max()) / observes.sum()
+    centred = log_exposures - weight @ log_exposures
+    kept = weight[:, None] * np.stack([np.ones(len(centred)), centred], axis=1)
+    return np.linalg.qr(kept, mode="complete")[0][:, 2:]
+
+
+def _worst(fit: comparagram.Fit, exclude: dict[int, float]) -> tuple[int | None, float]:
+    """The frame whose exposure the pictures contradict most, and the shift they ask for."""
+    best, at, shift = DECISIVE, None, 0.0
+    for k in range(len(fit.b)):
+        if k in exclude:
+            continue
+        alone = np.zeros((len(fit.b), 1))
+        alone[k] = 1.0
+        gain, d = fit.gain(alone)
+        if gain > best:
+            best, at, shift = gain, k, float(d[k])
+    return (at, shift) if abs(shift) > WRONG else (None, 0.0)
+
+
+def check(
+    samples: Sequence[Sample], exposures: Float, g: Float, sigma: Float
+) -> tuple[Float, Float]:
+    """How a known response, `g` and `sigma` (C, codes), fits a bracket: chi-square and RMS.
+
+    Both (C,), of the comparagrams' rows; RMS in ln units; chi-square over its expectation, the
+    curve's own standard errors and roundings of the times allowed for.
+
+    Raises
+    ------
+    UserError
+        When the bracket tells too little of a response to check one by it.
+
+    """
+    order = np.argsort(exposures, kind="stable")
+    samples = [samples[k] for k in order]
+    log_exposures = np.log(exposures[order])
+    pairs = comparagram.pair(log_exposures)
+    channels, _ = observe([s.patches for s in samples], pairs, log_exposures)
+    _refuse_few(channels, samples)
+    curves, errors = at_knots(g), at_knots(sigma)
+    zero = np.zeros(KNOTS)
+    system = [
+        comparagram.equations(rows, pairs, log_exposures, zero, curve)
+        for rows, curve in zip(channels, curves, strict=True)
+    ]
+    variance = [
+        1 / e.w + error[rows.b] ** 2 + rows.spread_over(error) ** 2
+        for e, rows, error in zip(system, channels, errors, strict=True)
+    ]
+    off = [e.y - e.D @ curve for e, curve in zip(system, curves, strict=True)]
+    if len(samples) > 2:
+        tt = sum(e.E.T @ (e.E / v[:, None]) for e, v in zip(system, variance, strict=True))
+        t0 = -sum(e.E.T @ (r / v) for e, r, v in zip(system, off, variance, strict=True))
+        free = NOMINAL * span_kept(log_exposures, np.diag(np.asarray(tt)))
+        d = free @ np.linalg.solve(
+            free.T @ tt @ free + np.eye(free.shape[1]), free.T @ t0
+        )
+        off = [r + e.E @ d for r, e in zip(off, system, strict=True)]
+    chi_square = np.array([np.mean(r**2 / v) for r, v in zip(off, variance, strict=True)])
+    return chi_square, _rms(off)
+
+
+def _debevec(
+    samples: Sequence[Sample], log_exposures: Float, smoothness: float, refine: bool
+) -> Solution:
+    codes = samples[0].codes
+    found = debevec.solve(
+        [s.patches for s in samples],
+        log_exposures,
+        smoothness=smoothness,
+        refine_times=refine,
+    )
+    if np.any(found.g[:, 240] - found.g[:, 16] <= 0):
+        _refuse_falling()
+    risen = np.stack(
+        [strictly_rising(c, e) for c, e in zip(found.g, found.sigma, strict=True)]
+    )
+    moved = (np.abs(risen - found.g) > 1e-9).sum(axis=1)
+    risen -= risen[:, MIDDLE, None]
+    return Solution(
+        method="debevec",
+        g=_zeroed(at_codes(risen, codes)),
+        sigma=at_codes(np.maximum(found.sigma, np.abs(risen - found.g)), codes),
+        log_exposures=found.log_exposures,
+        rms=found.rms,
+        rms_nominal=found.rms_nominal,
+        chi_square=np.full(len(risen), np.nan),
+        code_noise=_code_noise(samples, found.log_exposures, risen, None),
+        observed=found.observed,
+        used=found.used,
+        repaired=moved,
+        condition=found.condition,
+        patch=samples[0].patch,
+        refined=refine,
+        wrong=(),
+        unchanging=0.0,
+        extra={"smoothness": smoothness, "paper_lambda": found.paper_lambda},
+    )
+
+
+def from_solution(
+    solution: Solution,
+    channels: tuple[str, ...],
+    files: list[Path],
+    exposures: Float,
+    record: Mapping[str, Any],
+) -> Response:
+    """The contract's form of what the solver found."""
+    rows = zip(files, exposures, np.exp(solution.log_exposures), strict=True)
+    return Response(
+        channels=channels,
+        log_exposure=solution.g,
+        sigma=solution.sigma,
+        code_noise=solution.code_noise,
+        method=solution.method,
+        refined=solution.refined or bool(solution.wrong),
+        exposures=tuple(Exposed(f.name, float(given), float(used)) for f, given, used in rows),
+        record=record,
+    )
+
+
+def darkened(g: Float, darkness: float, pedestal: float) -> Float:
+    """The curve (256,) with a code of darkness: ln (z - z0) below the codes that tell of light.
+
+    z0 continues value and slope there, but is not below `darkness`: codes down from it are no
+    light at all, which the steep rest of the curve says.
+    """
+    if pedestal <= 0:
+        return g
+    z = np.arange(KNOTS)
+    first = int(np.ceil(pedestal + comparagram.DARKEST))
+    z0 = first - 1 / max(comparagram.slope_of(g)[first], 1 / (first - 1))
+    low = z < first
+    z0 = min(max(z0, darkness), first - 1.0)
+    light = np.maximum(z[low] - z0, 0.25)
+    dark = np.minimum(z[low] - z0 - 0.25, 0.0)
+    result = g.copy()
+    result[low] = g[first] + np.log(light / (first - z0)) + dark
+    return result
 
 
 def strictly_rising(g: Float, sigma: Float) -> Float:
-    """The nearest curve (weights 1/sigma^2) that rises by LEAST_STEP or more at every code."""
+    """The nearest curve (weights 1/sigma^2) that rises by LEAST_STEP or more at every knot."""
     ramp = LEAST_STEP * np.arange(len(g))
     if np.all(np.diff(g) >= LEAST_STEP):
         return g
@@ -237,55 +420,60 @@ def strictly_rising(g: Float, sigma: Float) -> Float:
     return risen
 
 
-@cache
-def _compiled() -> Any:
-    import jax
-    import jax.numpy as jnp
-
-    keep = np.delete(np.arange(CODES), MIDDLE)
-    w = hat()
-    R = roughness(w)
-
-    def one(H: Any, s: Any, tau: Any, smoothness: Any) -> Any:
-        M = (s * H[:CODES, :CODES] + smoothness * R)[jnp.ix_(keep, keep)]
-        right = (-s * H[:CODES, CODES:] @ tau)[keep]
-        d = 1 / jnp.sqrt(jnp.diag(M))
-        scaled = M * d[:, None] * d
-        both = jnp.concatenate([jnp.diag(d), (d * right)[:, None]], axis=1)
-        solved = d[:, None] * jax.scipy.linalg.cho_solve(
-            (jnp.linalg.cholesky(scaled), True), both
-        )
-        g = jnp.zeros(CODES).at[keep].set(solved[:, -1])
-        inverse = jnp.zeros((CODES, CODES)).at[jnp.ix_(keep, keep)].set(solved[:, :-1])
-        return g, inverse, scaled
-
-    return jax.jit(jax.vmap(one, in_axes=(0, 0, None, None)))
-
-
-def _solve(H: Float, s: Float, tau: Float, smoothness: float) -> tuple[Float, Float, Float]:
-    """Curves (C, 256), M^-1 (C, 256, 256) with zeros at the middle code, conditions (C,)."""
-    import jax
-
-    with jax.enable_x64(True):
-        found = _compiled()(H, s, tau, smoothness)
-        g, inverse, scaled = (np.asarray(part, np.float64) for part in found)
-    if not np.all(np.isfinite(g)):
-        raise UserError(
-            "the pictures do not determine a response (the matrix is singular): give more "
-            "exposures, or a larger --smoothness"
-        )
-    values = np.linalg.eigvalsh(scaled)  # numpy's: compiling JAX's costs seconds
-    return g, inverse, values[:, -1] / values[:, 0]
+def _code_noise(
+    samples: Sequence[Sample],
+    log_exposures: Float,
+    g: Float,
+    fit: comparagram.Fit | None,
+) -> Float:
+    """Standard deviation of a single pixel in codes, (C, codes), quantisation included."""
+    codes = samples[0].codes
+    pairs = comparagram.pair(log_exposures)
+    channels, _ = observe([s.pixels for s in samples], pairs, log_exposures)
+    noise = np.empty((len(g), KNOTS))
+    for c, (rows, curve) in enumerate(zip(channels, g, strict=True)):
+        if len(rows.b) >= FEWEST_KNOTS:
+            noise[c] = np.sqrt(comparagram.code_variance(rows, comparagram.slope_of(curve)))
+        elif fit is not None:  # too few single pixels: what patches say of one
+            noise[c] = samples[0].patch * np.sqrt(fit.equations[c].variance)
+        else:
+            raise UserError(
+                "too few pixels are well exposed in two pictures to tell their noise: give "
+                "exposures closer together"
+            )
+    return at_codes(noise * np.gradient(codes_at_knots(codes)), codes)
 
 
-def _code_noise(samples: Sequence[Sample], g: Float, log_exposures: Float) -> Float:
-    """Standard deviation of a single pixel in codes: residuals over the slope of g, (C,)."""
-    pixels = [frame.pixels for frame in samples]
-    w = hat()
-    share = np.ones(pixels[0].shape, np.float32)
-    _, within, freedom = kernel.residuals(pixels, w**2, share, g, log_exposures)
-    slope = np.gradient(g, axis=1)
-    return np.sqrt(within.sum(1) / np.maximum((freedom * slope**2).sum(1), 1e-300))
+def _observed(rows: Rows) -> Float:
+    """Patches that tell of each knot, (256,)."""
+    low = np.floor(rows.T).astype(np.intp)
+    return np.bincount(rows.b, rows.count, KNOTS) + np.bincount(low, rows.count, KNOTS)
+
+
+def _condition(e: comparagram.Equations, factor: Float) -> float:
+    H = ((e.D.multiply(e.w[:, None])).T @ e.D).toarray()
+    values = np.linalg.eigvalsh(factor.T @ H @ factor)
+    return float((1 + values[-1]) / (1 + max(values[0], 0)))
+
+
+def _brighter(rows: Rows) -> bool:
+    """Whether longer exposures are brighter, by most of the patches."""
+    return bool(np.sum(rows.count * np.sign(rows.b - rows.T)) >= 0)
+
+
+def _zeroed(g: Float) -> Float:
+    return g - g[:, g.shape[1] // 2, None]
+
+
+def _rms(residuals: Sequence[Float]) -> Float:
+    return np.array([np.sqrt(np.mean(r**2)) for r in residuals])
+
+
+def _refuse_falling() -> None:
+    raise UserError(
+        "longer exposures are not brighter: the exposure times are in another order than "
+        "the pictures, or the pictures show different scenes"
+    )
 
 
 def _refuse(samples: Sequence[Sample], log_exposures: Float, smoothness: float) -> None:
@@ -303,14 +491,16 @@ def _refuse(samples: Sequence[Sample], log_exposures: Float, smoothness: float) 
         raise UserError("all pictures are black: take longer exposures")
 
 
-def _refuse_few(samples: Sequence[Sample], used: NDArray[np.int64], observed: Float) -> None:
-    P, N = len(samples), int(used.min())
-    if N * (P - 1) <= CODES - 1:
+def _refuse_few(channels: Sequence[Rows], samples: Sequence[Sample]) -> None:
+    told = min(len({*rows.b.tolist(), *np.floor(rows.T).tolist()}) for rows in channels)
+    if told == 0:
         raise UserError(
-            f"only {N} patches of {samples[0].patch} pixels are well exposed in two pictures "
-            f"or more; a response needs N (P - 1) > {CODES - 1}: give exposures closer "
-            "together, or pictures that are less saturated and less dark"
+            f"no code is shown by {comparagram.FEWEST} patches of {samples[0].patch} pixels "
+            "that are well exposed in two pictures: give exposures closer together, or "
+            "pictures that are larger, less saturated and less dark"
         )
-    seen = int((observed > 0).sum(axis=1).min())
-    if seen < 3:
-        raise UserError(f"the pictures show {seen} code values: too few for a curve")
+    if told < FEWEST_KNOTS:
+        raise UserError(
+            f"the pictures tell of {told} code values: too few for a curve; photograph a "
+            "scene of more brightnesses"
+        )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -14,7 +14,7 @@ import numpy as np
 from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
-from chromeball.hdr.response import CODES, MIDDLE, Solution, hat
+from chromeball.hdr.knots import DEPTHS
 from chromeball.scene.errors import UserError
 from chromeball.scene.record import to_json
 
@@ -34,21 +34,21 @@ class _File(Struct, frozen=True, forbid_unknown_fields=True):
     codes: int
     log_exposure: list[list[float]]
     sigma: list[list[float]]
-    weights: list[float]
-    code_noise: list[float]
+    code_noise: list[list[float]]
+    method: str
     refined: bool
     exposures: list[Exposed]
     record: dict[str, Any]
-    version: int = 1
+    version: int = 2
 
 
 @dataclass(frozen=True)
 class Response:
     """A camera's response.
 
-    ``log_exposure``, ``sigma`` (C, 256): natural logarithm of exposure for each code, zero at
-    code 128 and strictly rising, and its standard error. ``weights`` (256,): the hat it was
-    solved with. ``code_noise`` (C,): standard deviation of a pixel, in codes. ``refined``: the
+    ``log_exposure``, ``sigma`` (C, codes): natural logarithm of exposure for each code, zero at
+    the middle code and strictly rising, and its standard error. ``code_noise`` (C, codes):
+    standard deviation of a pixel, in codes. ``method``: how it was found. ``refined``: the
     frames' exposures were unknowns too, and ``exposures`` holds both. ``record``: where the
     curve comes from, and its figures.
     """
@@ -56,57 +56,40 @@ class Response:
     channels: tuple[str, ...]
     log_exposure: Float
     sigma: Float
-    weights: Float
     code_noise: Float
+    method: str = "given"
     refined: bool = False
     exposures: tuple[Exposed, ...] = ()
     record: Mapping[str, Any] = field(default_factory=dict[str, Any])
 
+    @property
+    def codes(self) -> int:
+        """Number of code values."""
+        return self.log_exposure.shape[1]
+
     @classmethod
     def from_log_exposure(cls, log_exposure: Float) -> Response:
-        """A curve that is known: (C, 256), or (256,) for grey; zero at code 128 afterwards."""
+        """A curve that is known, (C, codes) or (codes,) for grey; zero at its middle afterwards."""
         curves = np.atleast_2d(log_exposure)
-        curves = curves - curves[:, MIDDLE, None]
+        curves = curves - curves[:, curves.shape[1] // 2, None]
         return cls(
             channels=("R", "G", "B") if len(curves) == 3 else ("Y",),
             log_exposure=curves,
             sigma=np.zeros_like(curves),
-            weights=hat(),
-            code_noise=np.full(len(curves), 12**-0.5),
+            code_noise=np.full_like(curves, 12**-0.5),
         )
-
-
-def from_solution(
-    solution: Solution,
-    channels: tuple[str, ...],
-    files: list[Path],
-    exposures: Float,
-    record: Mapping[str, Any],
-) -> Response:
-    """The contract's form of what the solver found."""
-    rows = zip(files, exposures, np.exp(solution.log_exposures), strict=True)
-    return Response(
-        channels=channels,
-        log_exposure=solution.g,
-        sigma=solution.sigma,
-        weights=hat(),
-        code_noise=solution.code_noise,
-        refined=solution.refined,
-        exposures=tuple(Exposed(f.name, float(given), float(used)) for f, given, used in rows),
-        record=record,
-    )
 
 
 def encode_response(response: Response) -> bytes:
     """The bytes of a ``response.json``."""
     content = {
-        "version": 1,
+        "version": 2,
         "channels": response.channels,
-        "codes": CODES,
+        "codes": response.codes,
+        "method": response.method,
         "log_exposure": response.log_exposure,
-        "sigma": response.sigma,
-        "weights": response.weights,
-        "code_noise": response.code_noise,
+        "sigma": _short(response.sigma),
+        "code_noise": _short(response.code_noise),
         "refined": response.refined,
         "exposures": [msgspec.to_builtins(row) for row in response.exposures],
         "record": response.record,
@@ -140,38 +123,42 @@ def parse_response(data: bytes, path: str | os.PathLike[str] = "response.json") 
         raise UserError(str(error).replace("`$.", "`"), file=path) from error
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise UserError(f"not valid JSON: {error}", file=path) from error
-    if content.version != 1:
-        raise UserError(f"version {content.version}: this program reads version 1", file=path)
-    if content.codes != CODES:
-        raise UserError(f"{content.codes} codes: only {CODES} are supported", file=path)
+    if content.version != 2:
+        raise UserError(
+            f"version {content.version}: this program reads version 2; solve it anew",
+            file=path,
+        )
+    codes = content.codes
+    if codes not in DEPTHS:
+        known = ", ".join(map(str, DEPTHS))
+        raise UserError(f"{codes} codes: cameras have one of {known}", file=path)
     count = len(content.channels)
     if len(set(content.channels)) != count:
         raise UserError("two channels have one name", file=path)
-    curves = _table(content.log_exposure, (count, CODES), "log_exposure", path)
-    sigma = _table(content.sigma, (count, CODES), "sigma", path)
-    weights = _table([content.weights], (1, CODES), "weights", path)[0]
-    noise = _table([content.code_noise], (1, count), "code_noise", path)[0]
+    curves = _table(content.log_exposure, (count, codes), "log_exposure", path)
+    sigma = _table(content.sigma, (count, codes), "sigma", path)
+    noise = _table(content.code_noise, (count, codes), "code_noise", path)
     for name, curve in zip(content.channels, curves, strict=True):
         if np.any(np.diff(curve) <= 0):
             code = int(np.argmax(np.diff(curve) <= 0)) + 1
             raise UserError(
                 f"log_exposure of channel {name} does not rise at code {code}", file=path
             )
-        if abs(curve[MIDDLE]) > 1e-9:
+        if abs(curve[codes // 2]) > 1e-9:
             raise UserError(
-                f"log_exposure of channel {name} is not zero at code {MIDDLE}", file=path
+                f"log_exposure of channel {name} is not zero at code {codes // 2}", file=path
             )
         if np.ptp(curve) > 80:
             raise UserError(f"log_exposure of channel {name} spans e^80 or more", file=path)
-    for name, table in (("sigma", sigma), ("weights", weights), ("code_noise", noise)):
+    for name, table in (("sigma", sigma), ("code_noise", noise)):
         if np.any(table < 0):
             raise UserError(f"{name} holds negative values", file=path)
     return Response(
         channels=tuple(content.channels),
         log_exposure=curves,
         sigma=sigma,
-        weights=weights,
         code_noise=noise,
+        method=content.method,
         refined=content.refined,
         exposures=tuple(content.exposures),
         record=content.record,
@@ -190,25 +177,38 @@ def _table(
 
 
 def exposures_for(
-    response: Response, exposures: Float, *, tolerance: float = 1e-3
+    response: Response,
+    exposures: Float,
+    names: Sequence[str] = (),
+    *,
+    tolerance: float = 1e-3,
 ) -> tuple[Float, int]:
     """Refined exposures for frames that were given `exposures`, and how many were found.
 
-    A camera's nominal times are rounded always alike, so a refined exposure serves every frame
-    of the same nominal one. Nothing is changed unless the response was refined.
+    A frame that the response was solved from is known by its name. A camera's nominal times
+    are rounded always alike, so a refined exposure serves other frames of the same nominal one
+    as well, unless two frames of that one came out differently. Nothing is changed unless the
+    response was refined.
     """
     if not response.refined:
         return exposures, 0
-    given = np.array([row.given for row in response.exposures])
-    used = np.array([row.used for row in response.exposures])
     result = exposures.copy()
     found = 0
     for k, exposure in enumerate(exposures):
-        nearest = int(np.argmin(np.abs(np.log(given / exposure))))
-        if abs(math.log(given[nearest] / exposure)) < tolerance:
-            result[k] = used[nearest]
+        alike = [
+            row for row in response.exposures if abs(math.log(row.given / exposure)) < tolerance
+        ]
+        own = [row for row in alike if k < len(names) and row.file == names[k]]
+        used = {row.used for row in own or alike}
+        if used and max(used) / min(used) < 1.02:
+            result[k] = float(np.mean(list(used)))
             found += 1
     return result, found
+
+
+def _short(table: Float) -> list[list[float]]:
+    """Six digits: what is itself an estimate needs no more."""
+    return [[float(f"{value:.6g}") for value in row] for row in table.tolist()]
 
 
 def plot_response(response: Response, path: str | os.PathLike[str]) -> None:
@@ -217,7 +217,7 @@ def plot_response(response: Response, path: str | os.PathLike[str]) -> None:
 
     figure = Figure(figsize=(9, 4), layout="constrained")
     curve, error = figure.subplots(1, 2)
-    z = np.arange(CODES)
+    z = np.arange(response.codes)
     colors = {"R": "#c0392b", "G": "#27853d", "B": "#2c5fa8"}
     for name, g, sigma in zip(
         response.channels, response.log_exposure, response.sigma, strict=True
@@ -233,5 +233,5 @@ def plot_response(response: Response, path: str | os.PathLike[str]) -> None:
     curve.legend(frameon=False)
     for axes in (curve, error):
         axes.grid(alpha=0.3)
-        axes.set_xlim(0, CODES - 1)
+        axes.set_xlim(0, response.codes - 1)
     figure.savefig(path, dpi=110, format="png", metadata={"Software": None})
