@@ -31,6 +31,10 @@ SMOOTH, SMOOTH_REACH = 1e-4, 20.0
 #: rougher deviations, the likeliest of which the data choose: variances, and reach in codes
 ROUGH, ROUGH_REACH = (1e-7, 1e-5, 1e-4), 20.0
 
+#: dark codes that no picture shows: below this code the slope of g over ln z is a random walk,
+#: so that curves of no camera in the database go on as they came, and less and less certain
+DARK_END, DARK_BEND = 48.0, 0.1
+
 
 @dataclass(frozen=True)
 class Prior:
@@ -60,10 +64,12 @@ class Prior:
         smooth = SMOOTH * np.exp(-0.5 * (distance / SMOOTH_REACH) ** 2)
         r = np.sqrt(3) * distance / ROUGH_REACH
         rough = (1 + r) * np.exp(-r)  # Matern 3/2: once differentiable
+        depth = np.log(DARK_END / np.clip(z, 0.25, DARK_END))
+        least = np.minimum(depth[:, None], depth)
+        bend = least**3 / 3 + np.abs(depth[:, None] - depth) * least**2 / 2
+        deviations = smooth + DARK_BEND**2 * bend + 1e-10 * np.eye(KNOTS)
         factors = [
-            np.linalg.cholesky(
-                curves[1:].T @ curves[1:] + smooth + variance * rough + 1e-10 * np.eye(KNOTS)
-            )
+            np.linalg.cholesky(curves[1:].T @ curves[1:] + deviations + variance * rough)
             for variance in ROUGH
         ]
         return curves[0], np.stack(factors)
