@@ -33,6 +33,7 @@ class Frame:
     aperture: float | None = None
     iso: float | None = None
     camera: str | None = None
+    scene: int = 0  # a take is one scene, the pictures named one by one are another
 
 
 @dataclass(frozen=True)
@@ -105,6 +106,7 @@ def read_bracket(
                         shot.row.aperture or seen.aperture,
                         shot.row.iso or seen.iso,
                         seen.camera,
+                        scene=len(files),
                     )
                 )
         else:

@@ -58,12 +58,13 @@ class Curves:
 
 def solve(
     pixels: Sequence[NDArray[np.uint16]],
+    scenes: Sequence[int],
     log_exposures: Float,
     *,
     smoothness: float = SMOOTHNESS,
     refine_times: bool = False,
 ) -> Curves:
-    """Solve from knots (N, C) of P frames, 8.8 fixed point.
+    """Solve from knots (N, C) of P frames, 8.8 fixed point; `scenes` numbers their scenes.
 
     The variance of g is the diagonal of ``s^2 M^-1 B M^-1``, M = s H + lambda D'D, B the
     scatter of the pixels' scores (a sandwich, so unequal noise is allowed for), plus what
@@ -77,8 +78,16 @@ def solve(
 
     """
     w = hat()
-    H, observed, used = kernel.accumulate(pixels, w**2)
-    P, N = len(pixels), int(used.min())
+    groups = [np.flatnonzero(np.array(scenes) == scene) for scene in sorted(set(scenes))]
+    parts = [kernel.accumulate([pixels[k] for k in own], w**2) for own in groups]
+    P, C = len(pixels), pixels[0].shape[1]
+    H = np.zeros((C, KNOTS + P, KNOTS + P))
+    for (part, _, _), own in zip(parts, groups, strict=True):
+        place = np.concatenate([np.arange(KNOTS), KNOTS + own])
+        H[np.ix_(np.arange(C), place, place)] += part
+    observed = np.sum([seen for _, seen, _ in parts], axis=0)
+    used = np.sum([count for _, _, count in parts], axis=0)
+    N = int(used.min())
     if N * (P - 1) <= KNOTS - 1:
         raise UserError(
             f"only {N} pixels are well exposed in two pictures or more; a response needs "
@@ -102,7 +111,16 @@ def solve(
         g, inverse = np.zeros((len(s), KNOTS)), np.zeros((len(s), KNOTS, KNOTS))
         g[:, keep] = found
         inverse[np.ix_(np.arange(len(s)), keep, keep)] = found_inverse
-        B, within, freedom = kernel.residuals(pixels, w**2, g, tau)
+        B, within, freedom = (
+            np.sum(sums, axis=0)
+            for sums in zip(
+                *(
+                    kernel.residuals([pixels[k] for k in own], w**2, g, tau[own])
+                    for own in groups
+                ),
+                strict=True,
+            )
+        )
         half = s[:, None, None] * inverse
         noise = np.einsum("cij,cjk,cik->ci", half, B, half, optimize=True)
         curvature = np.abs(w[1:-1] * np.diff(g, 2)) * (observed[:, 1:-1] > 0)

@@ -64,12 +64,15 @@ class Sample:
     codes: int
     dark: float  # share of values at the lowest code
     bright: float  # share at the highest
+    scene: int = 0  # frames of one scene and view share this number
 
 
-def sample(frame: NDArray[Any], codes: int = KNOTS, patch: int | None = None) -> Sample:
+def sample(
+    frame: NDArray[Any], codes: int = KNOTS, patch: int | None = None, scene: int = 0
+) -> Sample:
     """Reduce a frame (H, W, C), uint8 or uint16, to what the solvers need.
 
-    `patch` in pixels a side; 1 keeps every pixel.
+    `patch` in pixels a side; 1 keeps every pixel. Only frames of one `scene` are compared.
     """
     frame = np.ascontiguousarray(as_codes(frame, codes))
     height, width = frame.shape[:2]
@@ -88,6 +91,7 @@ def sample(frame: NDArray[Any], codes: int = KNOTS, patch: int | None = None) ->
         codes=codes,
         dark=float(np.mean(lattice == 0)),
         bright=float(np.mean(lattice == codes - 1)),
+        scene=scene,
     )
 
 
@@ -98,11 +102,13 @@ class Solution:
     ``g`` and ``sigma`` (C, codes): ln exposure of each code, zero at the middle one, and its
     standard error. ``log_exposures`` (P,): as given, corrected, or refined. ``rms`` and
     ``rms_nominal`` (C,): residual in ln units, of the equations solved. ``chi_square`` (C,):
-    of the same over its expectation. ``code_noise`` (C, codes): standard deviation of a pixel
-    in codes. ``observed`` (C, 256): patches that tell of a knot. ``repaired`` (C,): knots that
+    of the same over its expectation. ``code_noise`` (C,): standard deviation of a pixel in
+    codes, the median over those observed. ``observed`` (C, 256): patches that tell of a knot. ``repaired`` (C,): knots that
     were moved to make a curve rise. ``condition`` (C,): of the matrix solved. ``wrong``: frames
     whose exposure contradicts the pictures, with the factor to what was given. ``unchanging``:
-    share of patches that no exposure changes. ``extra``: figures of the one method.
+    share of patches that no exposure changes. ``frame_residual`` (P,): RMS residual in ln
+    units of the equations that a frame takes part in, NaN where it takes part in none.
+    ``extra``: figures of the one method.
     """
 
     method: Method
@@ -121,6 +127,7 @@ class Solution:
     refined: bool
     wrong: tuple[tuple[int, float], ...]
     unchanging: float
+    frame_residual: Float
     extra: dict[str, Any]
 
 
@@ -158,6 +165,7 @@ def solve(
     return replace(
         found,
         log_exposures=found.log_exposures[back],
+        frame_residual=found.frame_residual[back],
         wrong=tuple(sorted((int(order[k]), factor) for k, factor in found.wrong)),
     )
 
@@ -166,8 +174,7 @@ def _comparagram(
     samples: Sequence[Sample], log_exposures: Float, prior: Prior, refine: bool | None
 ) -> Solution:
     codes = samples[0].codes
-    pairs = comparagram.pair(log_exposures)
-    channels, unchanging = observe([s.patches for s in samples], pairs, log_exposures)
+    channels, pairs, unchanging = observe(samples, log_exposures)
     _refuse_few(channels, samples)
     if 2 * np.sum([_brighter(rows) for rows in channels]) < len(channels):
         _refuse_falling()
@@ -185,8 +192,7 @@ def _comparagram(
         wrong[k] = shift
         log_exposures = log_exposures.copy()
         log_exposures[k] += shift
-        pairs = comparagram.pair(log_exposures)
-        channels, unchanging = observe([s.patches for s in samples], pairs, log_exposures)
+        channels, pairs, unchanging = observe(samples, log_exposures)
         fit = comparagram.fit(channels, pairs, log_exposures, mean, factors)
 
     shift = np.zeros(P)
@@ -240,6 +246,7 @@ def _comparagram(
         refined=refined,
         wrong=tuple((k, float(np.exp(v))) for k, v in sorted(wrong.items())),
         unchanging=unchanging,
+        frame_residual=_by_frame(residuals, channels, pairs, P),
         extra={
             "roughness": fit.model,
             "pairs": len(pairs),
@@ -249,16 +256,27 @@ def _comparagram(
 
 
 def observe(
-    frames: Sequence[NDArray[np.uint16]],
-    pairs: Sequence[tuple[int, int]],
+    samples: Sequence[Sample],
     log_exposures: Float,
-) -> tuple[list[Rows], float]:
-    """Rows of each channel, and the share of patches that no exposure changes."""
-    still = kernel.unchanging(frames, UNCHANGING, BRIGHT_ENOUGH)
-    ridges = kernel.ridges(frames, pairs, still)
+    what: Literal["patches", "pixels"] = "patches",
+) -> tuple[list[Rows], list[tuple[int, int]], float]:
+    """Rows of each channel, their pairs of frames, and the share of what nothing changes."""
+    pairs: list[tuple[int, int]] = []
+    ridges: list[Float] = []
+    still: list[NDArray[np.uint8]] = []
+    for scene in sorted({s.scene for s in samples}):
+        own = np.array([k for k, s in enumerate(samples) if s.scene == scene])
+        frames = [getattr(samples[k], what) for k in own]
+        among = comparagram.pair(log_exposures[own])
+        if not among:
+            continue
+        still.append(kernel.unchanging(frames, UNCHANGING, BRIGHT_ENOUGH))
+        ridges.append(kernel.ridges(frames, among, still[-1]))
+        pairs += [(int(own[i]), int(own[j])) for i, j in among]
     steps = np.array([log_exposures[j] - log_exposures[i] for i, j in pairs])
-    channels = [comparagram.rows_of(ridges[:, c], steps) for c in range(ridges.shape[1])]
-    return channels, float(still.mean())
+    table = np.concatenate(ridges)
+    channels = [comparagram.rows_of(table[:, c], steps) for c in range(table.shape[1])]
+    return channels, pairs, float(np.concatenate(still).mean())
 
 
 def span_kept(log_exposures: Float, observes: Float) -> Float:
@@ -305,8 +323,7 @@ def check(
     order = np.argsort(exposures, kind="stable")
     samples = [samples[k] for k in order]
     log_exposures = np.log(exposures[order])
-    pairs = comparagram.pair(log_exposures)
-    channels, _ = observe([s.patches for s in samples], pairs, log_exposures)
+    channels, pairs, _ = observe(samples, log_exposures)
     _refuse_few(channels, samples)
     curves, errors = at_knots(g), at_knots(sigma)
     zero = np.zeros(KNOTS)
@@ -337,6 +354,7 @@ def _debevec(
     codes = samples[0].codes
     found = debevec.solve(
         [s.patches for s in samples],
+        [s.scene for s in samples],
         log_exposures,
         smoothness=smoothness,
         refine_times=refine,
@@ -365,6 +383,7 @@ def _debevec(
         refined=refine,
         wrong=(),
         unchanging=0.0,
+        frame_residual=np.full(len(samples), np.nan),
         extra={"smoothness": smoothness, "paper_lambda": found.paper_lambda},
     )
 
@@ -426,22 +445,38 @@ def _code_noise(
     g: Float,
     fit: comparagram.Fit | None,
 ) -> Float:
-    """Standard deviation of a single pixel in codes, (C, codes), quantisation included."""
-    codes = samples[0].codes
-    pairs = comparagram.pair(log_exposures)
-    channels, _ = observe([s.pixels for s in samples], pairs, log_exposures)
-    noise = np.empty((len(g), KNOTS))
+    """Standard deviation of a single pixel in codes, the median over knots, (C,)."""
+    width = np.gradient(codes_at_knots(samples[0].codes))  # codes a knot
+    channels, _, _ = observe(samples, log_exposures, "pixels")
+    noise = np.empty(len(g))
     for c, (rows, curve) in enumerate(zip(channels, g, strict=True)):
         if len(rows.b) >= FEWEST_KNOTS:
-            noise[c] = np.sqrt(comparagram.code_variance(rows, comparagram.slope_of(curve)))
+            variance = comparagram.code_variance(rows, comparagram.slope_of(curve))
         elif fit is not None:  # too few single pixels: what patches say of one
-            noise[c] = samples[0].patch * np.sqrt(fit.equations[c].variance)
+            variance = samples[0].patch ** 2 * fit.equations[c].variance
         else:
             raise UserError(
                 "too few pixels are well exposed in two pictures to tell their noise: give "
                 "exposures closer together"
             )
-    return at_codes(noise * np.gradient(codes_at_knots(codes)), codes)
+        seen = _observed(rows) > 0
+        noise[c] = np.median((np.sqrt(variance) * width)[seen if np.any(seen) else slice(None)])
+    return noise
+
+
+def _by_frame(
+    residuals: Sequence[Float],
+    channels: Sequence[Rows],
+    pairs: Sequence[tuple[int, int]],
+    frames: int,
+) -> Float:
+    """RMS residual of the rows of each frame, (P,)."""
+    table = np.array(pairs)
+    members = np.concatenate([table[rows.pair] for rows in channels])
+    squares = np.concatenate(residuals)[:, None] ** 2 * np.ones(2)
+    count = np.bincount(members.ravel(), minlength=frames)
+    total = np.bincount(members.ravel(), squares.ravel(), minlength=frames)
+    return np.where(count > 0, np.sqrt(total / np.maximum(count, 1)), np.nan)
 
 
 def _observed(rows: Rows) -> Float:
@@ -483,7 +518,10 @@ def _refuse(samples: Sequence[Sample], log_exposures: Float, smoothness: float) 
         raise UserError(f"{len(log_exposures)} exposures for {len(samples)} pictures")
     if not (np.isfinite(smoothness) and smoothness > 0):
         raise UserError(f"smoothness {smoothness} is not a positive number")
-    if np.ptp(log_exposures) < 1e-3:
+    groups: dict[int, list[float]] = {s.scene: [] for s in samples}
+    for s, log_exposure in zip(samples, log_exposures, strict=True):
+        groups[s.scene].append(log_exposure)
+    if max(np.ptp(group) for group in groups.values()) < 1e-3:
         raise UserError("all pictures have the same exposure: a response needs different ones")
     if all(frame.bright > 0.999 for frame in samples):
         raise UserError("all pictures are saturated: take shorter exposures")

@@ -1,4 +1,4 @@
-"""``response.json`` and the plot beside it."""
+"""``response.json``."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class _File(Struct, frozen=True, forbid_unknown_fields=True):
     codes: int
     log_exposure: list[list[float]]
     sigma: list[list[float]]
-    code_noise: list[list[float]]
+    code_noise: list[float]
     method: str
     refined: bool
     exposures: list[Exposed]
@@ -47,8 +47,8 @@ class Response:
     """A camera's response.
 
     ``log_exposure``, ``sigma`` (C, codes): natural logarithm of exposure for each code, zero at
-    the middle code and strictly rising, and its standard error. ``code_noise`` (C, codes):
-    standard deviation of a pixel, in codes. ``method``: how it was found. ``refined``: the
+    the middle code and strictly rising, and its standard error. ``code_noise`` (C,):
+    standard deviation of a pixel, in codes: the median over the codes. ``method``: how it was found. ``refined``: the
     frames' exposures were unknowns too, and ``exposures`` holds both. ``record``: where the
     curve comes from, and its figures.
     """
@@ -76,7 +76,7 @@ class Response:
             channels=("R", "G", "B") if len(curves) == 3 else ("Y",),
             log_exposure=curves,
             sigma=np.zeros_like(curves),
-            code_noise=np.full_like(curves, 12**-0.5),
+            code_noise=np.full(len(curves), 12**-0.5),
         )
 
 
@@ -89,7 +89,7 @@ def encode_response(response: Response) -> bytes:
         "method": response.method,
         "log_exposure": response.log_exposure,
         "sigma": _short(response.sigma),
-        "code_noise": _short(response.code_noise),
+        "code_noise": response.code_noise,
         "refined": response.refined,
         "exposures": [msgspec.to_builtins(row) for row in response.exposures],
         "record": response.record,
@@ -137,7 +137,7 @@ def parse_response(data: bytes, path: str | os.PathLike[str] = "response.json") 
         raise UserError("two channels have one name", file=path)
     curves = _table(content.log_exposure, (count, codes), "log_exposure", path)
     sigma = _table(content.sigma, (count, codes), "sigma", path)
-    noise = _table(content.code_noise, (count, codes), "code_noise", path)
+    noise = _table([content.code_noise], (1, count), "code_noise", path)[0]
     for name, curve in zip(content.channels, curves, strict=True):
         if np.any(np.diff(curve) <= 0):
             code = int(np.argmax(np.diff(curve) <= 0)) + 1
@@ -209,29 +209,3 @@ def exposures_for(
 def _short(table: Float) -> list[list[float]]:
     """Six digits: what is itself an estimate needs no more."""
     return [[float(f"{value:.6g}") for value in row] for row in table.tolist()]
-
-
-def plot_response(response: Response, path: str | os.PathLike[str]) -> None:
-    """Draw ln exposure over code with a band of two standard errors, and the errors, as PNG."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(9, 4), layout="constrained")
-    curve, error = figure.subplots(1, 2)
-    z = np.arange(response.codes)
-    colors = {"R": "#c0392b", "G": "#27853d", "B": "#2c5fa8"}
-    for name, g, sigma in zip(
-        response.channels, response.log_exposure, response.sigma, strict=True
-    ):
-        color = colors.get(name, "#444444")
-        curve.plot(z, g, color=color, lw=1.5, label=name)
-        curve.fill_between(z, g - 2 * sigma, g + 2 * sigma, color=color, alpha=0.2, lw=0)
-        error.semilogy(z[sigma > 0], sigma[sigma > 0], color=color, lw=1.2)
-    curve.set(xlabel="code", ylabel="ln exposure", title="response, ± 2 standard errors")
-    error.set(xlabel="code", ylabel="standard error of ln exposure", title="standard error")
-    low, high = response.log_exposure.min(), response.log_exposure.max()
-    curve.set_ylim(low - 0.1 * (high - low), high + 0.1 * (high - low))
-    curve.legend(frameon=False)
-    for axes in (curve, error):
-        axes.grid(alpha=0.3)
-        axes.set_xlim(0, response.codes - 1)
-    figure.savefig(path, dpi=110, format="png", metadata={"Software": None})

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from cyclopts import App, Parameter
 
@@ -41,98 +41,92 @@ def response(
     *,
     output: Output,
     times: Times = None,
+    method: Annotated[
+        Literal["comparagram", "debevec"],
+        Parameter(help="With a prior over real curves; or Debevec and Malik as published."),
+    ] = "comparagram",
     smoothness: Annotated[
-        float | None, Parameter(help="lambda, for one observation a code. Default 30.")
+        float | None, Parameter(help="debevec: lambda at one observation a code. Default 30.")
     ] = None,
     patch: Annotated[
         int | None,
         Parameter(help="Average codes over patches of this many pixels a side; 1: none."),
     ] = None,
     refine_times: Annotated[
-        bool,
-        Parameter(negative="", help="Solve for the exposures too; their span is kept."),
-    ] = False,
+        bool | None,
+        Parameter(
+            help="Solve for the exposures too, their span kept. comparagram: where the "
+            "pictures say so decisively, unless given."
+        ),
+    ] = None,
+    reuse: Annotated[
+        Path | None,
+        Parameter(help="A stored response: kept if it fits these pictures, else solved anew."),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Recover the response of a camera from a bracket of 8-bit pictures (Debevec-Malik)."""
-    from chromeball.hdr.bracket import pictures, read_bracket
-    from chromeball.hdr.response import SMOOTHNESS, Sample, sample, solve
-    from chromeball.hdr.response_file import encode_response, from_solution, plot_response
+    """Recover the response of a camera from a bracket of 8-bit or 16-bit pictures."""
+    from chromeball.hdr.bracket import read_bracket
+    from chromeball.hdr.debevec import SMOOTHNESS
+    from chromeball.hdr.plots import plot_comparagrams, plot_response
+    from chromeball.hdr.response import from_solution, solve
+    from chromeball.hdr.response_file import encode_response, read_response
+    from chromeball.hdr.response_files import figures_of, fitting, read_samples, told
 
+    if method != "debevec" and smoothness is not None:
+        raise UserError("--smoothness is lambda of --method debevec: leave it out")
     bracket = read_bracket(inputs, parse_times(times))
-    smoothness = SMOOTHNESS if smoothness is None else smoothness
+    stored = read_response(reuse) if reuse is not None and reuse.is_file() else None
+    if reuse is not None and stored is None:
+        _tell(f"{reuse}: no stored response; solving one")
     check_output(output)
     with Stage(
         "hdr response",
-        inputs=bracket.inputs,
+        inputs=[*bracket.inputs, *([reuse] if reuse is not None and stored else [])],
         times=times,
+        method=method,
         smoothness=smoothness,
         patch=patch,
         refine_times=refine_times,
+        reuse=reuse,
     ) as stage:
-        samples: list[Sample] = []
-        channels: tuple[str, ...] = ()
-        for picture in pictures(bracket, _tell):
-            if picture.linear:
-                raise UserError(
-                    "a linear picture needs no response; `hdr merge` takes it as it is",
-                    file=picture.path,
-                )
-            if str(picture.pixels.dtype) != "uint8":
-                raise UserError(
-                    f"{picture.pixels.dtype} codes: a response is solved from 8-bit pictures",
-                    file=picture.path,
-                )
-            samples.append(sample(picture.pixels, patch))
-            channels = picture.channels
-        found = solve(
-            samples, bracket.exposures, smoothness=smoothness, refine_times=refine_times
-        )
-        observed = found.observed > 0
-        plot = output.with_name(output.stem + ".plot.png")
-        stage.figures |= {
-            "method": "Debevec-Malik, density-balanced patch means",
-            "channels": channels,
-            "pictures": len(samples),
-            "exposure_scale": bracket.scale,
-            "residual_rms": found.rms,
-            "residual_rms_given_times": found.rms_nominal,
-            "standard_error_median": [_median(s) for s in found.sigma],
-            "standard_error_max": found.sigma.max(axis=1),
-            "condition": found.condition,
-            "code_noise": found.code_noise,
-            "monotonicity_repairs": found.repaired,
-            "codes_observed": observed.sum(axis=1),
-            "patches_used": found.used,
-            "patch": found.patch,
-            "smoothness": smoothness,
-            "times_refined": refine_times,
-            "largest_time_change_ev": _largest_change(found.log_exposures, bracket.exposures),
-            "plot": plot.name,
-        }
-        curve = from_solution(
-            found,
-            channels,
-            bracket.paths,
-            bracket.exposures,
-            {**stage.figures, "inputs": [path.name for path in bracket.paths]},
-        )
+        if method == "debevec" and patch is None:
+            patch = 1  # all pixels, as published
+        samples, channels = read_samples(bracket, patch, _tell)
+        kept = None
+        if stored is not None and reuse is not None:
+            kept, why = fitting(stored, samples, channels, bracket)
+            _tell(why)
+            stage.figures["reuse"] = why
+        if kept is None:
+            found = solve(
+                samples,
+                bracket.exposures,
+                method=method,
+                smoothness=SMOOTHNESS if smoothness is None else smoothness,
+                refine_times=refine_times,
+            )
+            stage.figures |= figures_of(found, bracket, channels)
+            lines = told(found, bracket)
+            with stage.output(_beside(output, "comparagrams")) as temporary:
+                plot_comparagrams(samples, found, bracket.paths, temporary)
+            stage.figures["comparagrams"] = _beside(output, "comparagrams").name
+            kept = from_solution(
+                found,
+                channels,
+                bracket.paths,
+                bracket.exposures,
+                {**stage.figures, "inputs": [path.name for path in bracket.paths]},
+            )
+        else:
+            lines = [str(stage.figures["reuse"])]
+        plot = _beside(output, "plot")
+        stage.figures["plot"] = plot.name
         with stage.output(plot) as temporary:
-            plot_response(curve, temporary)
+            plot_response(kept, temporary)
         with stage.output(output) as temporary:
-            temporary.write_bytes(encode_response(curve))
-    _report(
-        output,
-        as_json,
-        [
-            f"residual {_each(found.rms, '.4f')} ln",
-            f"standard error {max(_median(s) for s in found.sigma):.4f} median, "
-            f"{found.sigma.max():.3f} max",
-            f"condition {found.condition.max():.1e}",
-            f"{int(found.used.min())} patches of {found.patch} x {found.patch}",
-            f"{int(found.repaired.sum())} codes repaired to rise",
-        ],
-    )
+            temporary.write_bytes(encode_response(kept))
+    _report(output, as_json, lines)
 
 
 @app.command
@@ -272,6 +266,10 @@ def merge(
     )
 
 
+def _beside(output: Path, what: str) -> Path:
+    return output.with_name(f"{output.stem}.{what}.png")
+
+
 def _tell(message: str) -> None:
     print(message, file=sys.stderr)
 
@@ -282,18 +280,6 @@ def _report(output: Path, as_json: bool, lines: list[str]) -> None:
         print(json.dumps({"output": str(output), **record["figures"]}))
     else:
         print("\n".join([str(output), *(f"  {line}" for line in lines)]))
-
-
-def _median(values: Any) -> float:
-    import numpy as np
-
-    return float(np.median(values[values > 0])) if np.any(values > 0) else 0.0
-
-
-def _largest_change(log_exposures: Any, exposures: Any) -> float:
-    import numpy as np
-
-    return float(np.abs(log_exposures - np.log(exposures)).max() / np.log(2))
 
 
 def _each(values: Any, form: str = "") -> str:

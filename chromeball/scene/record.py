@@ -134,7 +134,7 @@ def to_json(value: object) -> Json:
         case None | bool() | int() | str():
             return value
         case float():
-            return value if math.isfinite(value) else None
+            return float(value) if math.isfinite(value) else None  # numpy's are floats, too
         case np.ndarray() | np.generic():
             return to_json(value.tolist())
         case os.PathLike():
