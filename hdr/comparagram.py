@@ -50,6 +50,8 @@ PHASE = 0.08
 DEPENDENCE = 2.0
 #: frames are paired up to this ratio of exposures (3.2 EV), and with the next in any case
 WIDEST = np.log(2) * 3.2
+#: darkness scatters by less than this many knots
+PEDESTAL_SPREAD = 6.0
 #: knots of the piecewise linear code noise
 NOISE_KNOTS = np.array([0.0, 8, 20, 40, 70, 110, 150, 190, 225, 255])
 
@@ -110,9 +112,7 @@ class Rows:
         column = np.stack([self.b, low, np.minimum(low + 1, KNOTS - 1)])
         value = np.stack([np.ones(n), u - 1, -u])
         row = np.tile(np.arange(n), (3, 1))
-        return csr_array(
-            (value.ravel(), (row.ravel(), column.ravel())), shape=(n, KNOTS)
-        )
+        return csr_array((value.ravel(), (row.ravel(), column.ravel())), shape=(n, KNOTS))
 
     def _split(self) -> tuple[NDArray[np.intp], Float]:
         low = np.floor(self.T).astype(np.intp)
@@ -127,20 +127,21 @@ def rows_of(ridge: Float, steps: Float) -> Rows:
     count, lower, T, upper = np.moveaxis(ridge, 1, 0)
     spread = (upper - lower) / 1.349  # of a normal distribution
     shown = count >= FEWEST
-    darkness, pedestal = _pedestal(np.where(shown, _CODES - T, np.nan), spread, steps)
+    darkness, pedestal = _pedestal(np.where(shown, _CODES - T, np.nan), count, spread, steps)
     usable = shown & (pedestal + DARKEST <= T) & (_CODES <= BRIGHTEST) & (_CODES >= DARKEST)
     k, b = np.nonzero(usable)
     return Rows(k, b, T[k, b], count[k, b], spread[k, b], _smooth(count, 9), darkness, pedestal)
 
 
-def _pedestal(fall: Float, spread: Float, steps: Float) -> tuple[float, float]:
+def _pedestal(fall: Float, count: Float, spread: Float, steps: Float) -> tuple[float, float]:
     """The knot of darkness (film base, raised black), and up to where noise takes it.
 
     `fall` (K, 256) is b - T(b), NaN where too few patches tell. A knot is dark where at least
     half of the pairs that tell of it see a fall of less than 1 knot for 1 EV; darkness itself
-    is where they see none.
+    is where they see none. Nothing is darker than darkness.
     """
-    tells = np.isfinite(fall) & (steps[:, None] > 0.5)
+    # what moved shows one code here and anything there
+    tells = np.isfinite(fall) & (steps[:, None] > 0.5) & (spread < PEDESTAL_SPREAD)
     fallen = np.nan_to_num(fall, nan=np.inf)
     enough = np.maximum(tells.sum(axis=0), 1)
 
@@ -153,7 +154,13 @@ def _pedestal(fall: Float, spread: Float, steps: Float) -> tuple[float, float]:
     dark = highest(steps[:, None] / np.log(2))
     if dark == 0:
         return 0.0, 0.0
-    return float(highest(0.0)), dark + 2 * float(np.median(spread[:, dark][tells[:, dark]]))
+    noise = float(np.median(spread[:, dark][tells[:, dark]]))
+    darkness = highest(0.0)
+    shown = count[:, int(DARKEST) :].sum(axis=0)
+    darker = shown[: max(0, int(darkness - 3 * noise - 2 - DARKEST))].sum()
+    if darker > 0.02 * shown.sum():
+        return 0.0, 0.0
+    return float(darkness), dark + 2 * noise
 
 
 def _smooth(values: Float, width: int) -> Float:
@@ -166,7 +173,7 @@ def _smooth(values: Float, width: int) -> Float:
 
 
 def slope_of(g: Float) -> Float:
-    """g' of a curve (256,), smoothed and positive."""
+    """G' of a curve (256,), smoothed and positive."""
     return np.maximum(np.gradient(_smooth(g, 5)), 1e-4)
 
 
@@ -243,9 +250,15 @@ def equations(
     E = np.zeros((len(rows.b), len(log_exposures)))
     E[at, j[rows.pair]] += 1
     E[at, i[rows.pair]] -= 1
+    # a ridge much wider than noise makes it holds what moved: its median says little
+    at_T = rows.spread_over(slope)
+    noise = rows.spread_over(slope**2 * variance) + (slope**2 * variance)[rows.b]
+    wide = np.maximum((rows.spread * at_T) ** 2 / noise / 4, 1.0)
     D = rows.design()
     y = E @ log_exposures + bias - D @ mean
-    return Equations(D, E, y, 1 / (misfit * row_variance(rows, slope, bias)), variance)
+    return Equations(
+        D, E, y, 1 / (misfit * wide**2 * row_variance(rows, slope, bias)), variance
+    )
 
 
 def misfit_of(e: Equations, residual: Float) -> Float:
@@ -311,15 +324,16 @@ def fit(
             np.stack(part) for part in zip(*(_normal(e) for e in system), strict=True)
         )
         # the first pass is for the slopes and the misfit alone
-        QX, Q, logdet = posterior(H, X, factors if final else factors[:1])
-        gain = 0.5 * np.einsum("cn,cmn->cm", X[..., 0], QX[..., 0]) - 0.5 * logdet
+        all_moved, all_Q, logdet = posterior(H, X, factors if final else factors[:1])
+        gain = 0.5 * np.einsum("cn,cmn->cm", X[..., 0], all_moved[..., 0]) - 0.5 * logdet
         model = np.argmax(gain, axis=1)
         at = np.arange(len(channels))
-        QX, Q = QX[at, model], Q[at, model]
+        QX, Q = all_moved[at, model], all_Q[at, model]
         curves = mean + QX[..., 0]
         if not final:
             misfit = [
-                misfit_of(e, (e.y - e.D @ (g - mean))) for e, g in zip(system, curves, strict=True)
+                misfit_of(e, (e.y - e.D @ (g - mean)))
+                for e, g in zip(system, curves, strict=True)
             ]
     P = len(log_exposures)
     gt, Qgt = X[..., 1 : P + 1], QX[..., 1 : P + 1]
@@ -338,5 +352,5 @@ def _normal(e: Equations) -> tuple[Float, Float, Float, Float]:
     """D'WD, right sides (D'Wy, -D'WE, zeros up to a multiple of 16), E'WE, -E'Wy."""
     DW, EW = (e.D.multiply(e.w[:, None])).T, e.E.T * e.w
     X = np.concatenate([(DW @ e.y)[:, None], -(DW @ e.E)], axis=1)
-    X = np.pad(X, [(0, 0), (0, -X.shape[1] % 16)])  # fewer shapes to compile
-    return (DW @ e.D).toarray(), X, EW @ e.E, -EW @ e.y
+    fewer_shapes = np.pad(X, [(0, 0), (0, -X.shape[1] % 16)])  # to compile
+    return (DW @ e.D).toarray(), fewer_shapes, EW @ e.E, -EW @ e.y

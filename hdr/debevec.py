@@ -40,8 +40,10 @@ def hat() -> Float:
 
 @dataclass(frozen=True)
 class Curves:
-    """``g`` and ``sigma`` (C, 256): ln exposure and its standard error, noise and smoothing
-    bias together. ``log_exposures`` (P,) as given or refined; ``rms``, ``rms_nominal``,
+    """What the solve finds.
+
+    ``g`` and ``sigma`` (C, 256): ln exposure and its standard error, noise and smoothing bias
+    together. ``log_exposures`` (P,) as given or refined; ``rms``, ``rms_nominal``,
     ``condition``, ``paper_lambda`` (C,); ``observed`` (C, 256) and ``used`` (C,): pixels.
     """
 
@@ -78,12 +80,15 @@ def solve(
 
     """
     w = hat()
-    groups = [np.flatnonzero(np.array(scenes) == scene) for scene in sorted(set(scenes))]
+    groups = [
+        [k for k, scene in enumerate(scenes) if scene == number]
+        for number in sorted(set(scenes))
+    ]
     parts = [kernel.accumulate([pixels[k] for k in own], w**2) for own in groups]
     P, C = len(pixels), pixels[0].shape[1]
     H = np.zeros((C, KNOTS + P, KNOTS + P))
     for (part, _, _), own in zip(parts, groups, strict=True):
-        place = np.concatenate([np.arange(KNOTS), KNOTS + own])
+        place = np.concatenate([np.arange(KNOTS), KNOTS + np.array(own)])
         H[np.ix_(np.arange(C), place, place)] += part
     observed = np.sum([seen for _, seen, _ in parts], axis=0)
     used = np.sum([count for _, _, count in parts], axis=0)

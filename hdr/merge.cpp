@@ -206,7 +206,7 @@ void merge_codes_n(const Stack<T>& stack, const Codes& k, Merged& merged) {
       // else the longest frame says "at most".
       bool bright = false;
       std::size_t f = 0;
-      for (; f < P && !bright; ++f) bright = stack.data[f][at] >= N / 2;
+      for (; f < P && !bright; ++f) bright = stack.data[f][at] >= k.saturated[c] / 2;
       f = bright ? f - 1 : P - 1;
       radiance[i] = static_cast<float>(k.exposure[c * N + stack.data[f][at]] / k.times[f]);
       if (merged.sigma) merged.sigma[at] = infinity;

@@ -36,6 +36,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chromeball.hdr import kernel
+from chromeball.hdr.knots import as_codes
 from chromeball.hdr.noise import CodeNoise, slopes
 from chromeball.hdr.response_file import Response
 from chromeball.scene.errors import UserError
@@ -145,7 +146,7 @@ def merge_frames(
 ) -> Radiance:
     """Merge frames of codes (H, W, C), C of 1 or 3, with the response of their camera.
 
-    uint8 frames need a response of 256 codes, uint16 ones a response of 65536. `tables` are
+    uint16 frames hold as many codes as the response has, 256 to 65536. `tables` are
     those of :func:`code_weights`, with the response's own constant noise unless given.
 
     Raises
@@ -159,10 +160,10 @@ def merge_frames(
     kind = frames[0].dtype
     if kind != np.uint8 and kind != np.uint16:
         raise UserError(f"pictures of {kind} values: 8-bit or 16-bit codes are needed")
-    if codes != np.iinfo(kind).max + 1:
+    if kind == np.uint8 and codes != 256:
         raise UserError(
-            f"{8 * kind.itemsize}-bit pictures, but the response has {codes} codes: solve the "
-            "response from pictures of the same depth"
+            f"8-bit pictures, but the response has {codes} codes: solve the response from "
+            "pictures of the same depth"
         )
     if shape[2] != len(response.channels):
         raise UserError(
@@ -171,13 +172,16 @@ def merge_frames(
         )
     order = np.argsort(exposures, kind="stable")
     tables = tables or code_weights(response)
-    merge = kernel.merge_codes_u8 if kind == np.uint8 else kernel.merge_codes_u16
+    held = [as_codes(frames[j], codes) for j in order]
+    # the kernel's tables go to the end of the type, where no code of fewer bits is
+    beyond = ((0, 0), (0, np.iinfo(held[0].dtype).max + 1 - codes))
+    merge = kernel.merge_codes_u8 if held[0].dtype == np.uint8 else kernel.merge_codes_u16
     merged = _empty(shape, sigma)
     counts = merge(
-        [_flat(frames[j]) for j in order],
-        tables.weight,
-        np.exp(response.log_exposure),
-        tables.taper,
+        [_flat(frame) for frame in held],
+        np.pad(tables.weight, beyond),
+        np.exp(np.pad(response.log_exposure, beyond, mode="edge")),
+        np.pad(tables.taper, beyond),
         tables.expected,
         tables.saturated,
         np.ascontiguousarray(exposures[order]),

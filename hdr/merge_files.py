@@ -58,6 +58,12 @@ def prepare_codes(
     frames: Frames, exposures: Float, response: Response, *, sigma: bool, snr: float | None
 ) -> Prepared:
     """Measure the noise of a bracket of codes and decide which frames are merged."""
+    brightest = max(int(s.largest.max()) for s in frames.samples)
+    if brightest >= response.codes:
+        raise UserError(
+            f"code {brightest} in the pictures, but the response has {response.codes} codes: "
+            "solve the response from pictures of the same depth"
+        )
     order = np.argsort(exposures, kind="stable")
     values = [frames.samples[j].values for j in order]
     noise, origin = measure_codes(values, exposures[order], response), "bracket"

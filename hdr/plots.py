@@ -105,7 +105,7 @@ def plot_comparagrams(
         if not among:
             continue
         still = kernel.unchanging(frames, UNCHANGING, BRIGHT_ENOUGH)
-        cells += [np.float64(C[0]) for C in kernel.comparagrams(frames, among, still)]
+        cells += list(kernel.comparagrams(frames, among, still)[:, 0].astype(np.float64))
         pairs += [(own[i], own[j]) for i, j in among]
     chosen = np.linspace(0, len(pairs) - 1, min(most, len(pairs))).astype(int)
     columns = min(3, len(chosen))

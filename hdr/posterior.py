@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -30,17 +31,24 @@ def cache_folder() -> Path:
 def _jax() -> Any:
     import jax
 
-    jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "jax"))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    config: Any = jax.config
+    config.update("jax_compilation_cache_dir", str(cache_folder() / "jax"))
+    config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    config.update("jax_persistent_cache_min_entry_size_bytes", -1)
     return jax
+
+
+@cache
+def _lineax() -> Any:
+    return import_module("lineax")  # it has no types
 
 
 @cache
 def _posterior() -> Any:
     jax = _jax()
     import jax.numpy as jnp
-    import lineax as lx
+
+    lx = _lineax()
 
     def one(H: Any, X: Any, A: Any) -> Any:
         K = jnp.eye(A.shape[1]) + A.T @ H @ A
@@ -77,7 +85,8 @@ def posterior(H: Float, X: Float, A: Float) -> tuple[Float, Float, Float]:
 def _pinned() -> Any:
     jax = _jax()
     import jax.numpy as jnp
-    import lineax as lx
+
+    lx = _lineax()
 
     def one(M: Any, right: Any) -> Any:
         d = 1 / jnp.sqrt(jnp.diag(M))

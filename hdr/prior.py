@@ -92,7 +92,7 @@ def distances(g: Float) -> Float:
 
 
 def inverse_curves(irradiance: Float, brightness: Float) -> Float:
-    """ln exposure at the 256 codes of curves given as brightness over irradiance, (N, n) each.
+    """Ln exposure at the 256 codes of curves given as brightness over irradiance, (N, n) each.
 
     Code 0 is no exposure at all: its value goes on from those above it.
     """

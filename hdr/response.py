@@ -103,12 +103,12 @@ class Solution:
     standard error. ``log_exposures`` (P,): as given, corrected, or refined. ``rms`` and
     ``rms_nominal`` (C,): residual in ln units, of the equations solved. ``chi_square`` (C,):
     of the same over its expectation. ``code_noise`` (C,): standard deviation of a pixel in
-    codes, the median over those observed. ``observed`` (C, 256): patches that tell of a knot. ``repaired`` (C,): knots that
-    were moved to make a curve rise. ``condition`` (C,): of the matrix solved. ``wrong``: frames
-    whose exposure contradicts the pictures, with the factor to what was given. ``unchanging``:
-    share of patches that no exposure changes. ``frame_residual`` (P,): RMS residual in ln
-    units of the equations that a frame takes part in, NaN where it takes part in none.
-    ``extra``: figures of the one method.
+    codes, the median over those observed. ``observed`` (C, 256): patches that tell of a knot.
+    ``repaired`` (C,): knots that were moved to make a curve rise. ``condition`` (C,): of the
+    matrix solved. ``wrong``: frames whose exposure contradicts the pictures, with the factor
+    to what was given. ``unchanging``: share of patches that no exposure changes.
+    ``frame_residual`` (P,): RMS residual in ln units of the equations that a frame takes part
+    in, NaN where it takes part in none. ``extra``: figures of the one method.
     """
 
     method: Method
@@ -180,18 +180,17 @@ def _comparagram(
         _refuse_falling()
     mean, factors = prior.at(codes)
     P = len(log_exposures)
-    nominal = log_exposures
     fit = comparagram.fit(channels, pairs, log_exposures, mean, factors)
     given = fit.residuals(fit.g, mean, np.zeros(P))
 
     wrong: dict[int, float] = {}
     while P >= 3 and len(wrong) < P // 3:
-        k, shift = _worst(fit, exclude=wrong)
+        k, off = _worst(fit, exclude=wrong)
         if k is None:
             break
-        wrong[k] = shift
+        wrong[k] = off
         log_exposures = log_exposures.copy()
-        log_exposures[k] += shift
+        log_exposures[k] += off
         channels, pairs, unchanging = observe(samples, log_exposures)
         fit = comparagram.fit(channels, pairs, log_exposures, mean, factors)
 
@@ -204,7 +203,12 @@ def _comparagram(
     if refined:
         log_exposures = log_exposures + shift
         fit = comparagram.fit(channels, pairs, log_exposures, mean, factors)
-    g = np.stack([darkened(c, rows.darkness, rows.pedestal) for c, rows in zip(fit.g, channels, strict=True)])
+    g = np.stack(
+        [
+            darkened(c, rows.darkness, rows.pedestal)
+            for c, rows in zip(fit.g, channels, strict=True)
+        ]
+    )
     rise = g[:, 240] - g[:, 16]
     if np.any(rise <= 0):
         _refuse_falling()
@@ -240,8 +244,9 @@ def _comparagram(
         observed=observed,
         used=np.array([int(rows.count.sum()) for rows in channels]),
         repaired=moved_knots,
-        condition=np.array([_condition(e, factors[q]) for e, q in
-                            zip(fit.equations, fit.model, strict=True)]),
+        condition=np.array(
+            [_condition(e, factors[q]) for e, q in zip(fit.equations, fit.model, strict=True)]
+        ),
         patch=samples[0].patch,
         refined=refined,
         wrong=tuple((k, float(np.exp(v))) for k, v in sorted(wrong.items())),
@@ -340,9 +345,7 @@ def check(
         tt = sum(e.E.T @ (e.E / v[:, None]) for e, v in zip(system, variance, strict=True))
         t0 = -sum(e.E.T @ (r / v) for e, r, v in zip(system, off, variance, strict=True))
         free = NOMINAL * span_kept(log_exposures, np.diag(np.asarray(tt)))
-        d = free @ np.linalg.solve(
-            free.T @ tt @ free + np.eye(free.shape[1]), free.T @ t0
-        )
+        d = free @ np.linalg.solve(free.T @ tt @ free + np.eye(free.shape[1]), free.T @ t0)
         off = [r + e.E @ d for r, e in zip(off, system, strict=True)]
     chi_square = np.array([np.mean(r**2 / v) for r, v in zip(off, variance, strict=True)])
     return chi_square, _rms(off)
@@ -361,9 +364,7 @@ def _debevec(
     )
     if np.any(found.g[:, 240] - found.g[:, 16] <= 0):
         _refuse_falling()
-    risen = np.stack(
-        [strictly_rising(c, e) for c, e in zip(found.g, found.sigma, strict=True)]
-    )
+    risen = np.stack([strictly_rising(c, e) for c, e in zip(found.g, found.sigma, strict=True)])
     moved = (np.abs(risen - found.g) > 1e-9).sum(axis=1)
     risen -= risen[:, MIDDLE, None]
     return Solution(

@@ -46,11 +46,11 @@ class _File(Struct, frozen=True, forbid_unknown_fields=True):
 class Response:
     """A camera's response.
 
-    ``log_exposure``, ``sigma`` (C, codes): natural logarithm of exposure for each code, zero at
-    the middle code and strictly rising, and its standard error. ``code_noise`` (C,):
-    standard deviation of a pixel, in codes: the median over the codes. ``method``: how it was found. ``refined``: the
-    frames' exposures were unknowns too, and ``exposures`` holds both. ``record``: where the
-    curve comes from, and its figures.
+    ``log_exposure``, ``sigma`` (C, codes): natural logarithm of exposure for each code, zero
+    at the middle code and strictly rising, and its standard error. ``code_noise`` (C,):
+    standard deviation of a pixel, in codes: the median over the codes. ``method``: how it was
+    found. ``refined``: the frames' exposures were unknowns too, and ``exposures`` holds both.
+    ``record``: where the curve comes from, and its figures.
     """
 
     channels: tuple[str, ...]
@@ -69,7 +69,7 @@ class Response:
 
     @classmethod
     def from_log_exposure(cls, log_exposure: Float) -> Response:
-        """A curve that is known, (C, codes) or (codes,) for grey; zero at its middle afterwards."""
+        """A curve that is known, (C, codes), or (codes,) for grey; zero at its middle then."""
         curves = np.atleast_2d(log_exposure)
         curves = curves - curves[:, curves.shape[1] // 2, None]
         return cls(

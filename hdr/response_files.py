@@ -90,9 +90,7 @@ def fitting(
     return replace(stored, record=record), f"stored response fits ({figures}): kept"
 
 
-def figures_of(
-    found: Solution, bracket: Bracket, channels: tuple[str, ...]
-) -> dict[str, Any]:
+def figures_of(found: Solution, bracket: Bracket, channels: tuple[str, ...]) -> dict[str, Any]:
     """What the record and the report say of a solution."""
     names = [path.name for path in bracket.paths]
     used = np.exp(found.log_exposures)

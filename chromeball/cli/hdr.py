@@ -176,7 +176,8 @@ def merge(
     curve = None if response is None else read_response(response)
     exposures, refined = bracket.exposures, 0
     if curve is not None:
-        exposures, refined = exposures_for(curve, bracket.exposures)
+        names = [path.name for path in bracket.paths]
+        exposures, refined = exposures_for(curve, bracket.exposures, names)
         if curve.refined:
             _tell(f"refined exposures from {response} for {refined} of {len(exposures)}")
     check_output(output)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -105,6 +107,82 @@ def test_linear_pictures_need_no_response(tmp_path: Path) -> None:
     np.testing.assert_allclose(image.pixels[..., :3][measured], radiance[measured], rtol=1e-5)
 
 
+def test_a_stored_response_is_kept_while_it_fits(
+    bracket: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first, second = tmp_path / "first.json", tmp_path / "second.json"
+    words = ("hdr", "response", "--times", LIST)
+    run(*words, *bracket, "--reuse", first, "-o", first)
+    assert "no stored response" in capsys.readouterr().err
+    run(*words, *bracket, "--reuse", first, "-o", second)
+    assert "stored response fits" in capsys.readouterr().err
+    a, b = (json.loads(path.read_text()) for path in (first, second))
+    assert a["log_exposure"] == b["log_exposure"]
+    assert b["record"]["reused_for"] == [path.name for path in bracket]
+    other = [tmp_path / f"other{j}.png" for j in range(len(TIMES))]
+    for path, frame in zip(other, photograph(scene(), gamma=1.6), strict=True):
+        write_picture(path, frame)
+    run(*words, *other, "--reuse", first, "-o", second)
+    assert "no longer fits" in capsys.readouterr().err
+    c = json.loads(second.read_text())
+    difference = np.array(c["log_exposure"])[:, 30:240] - log_exposure(1.6)[30:240]
+    assert np.sqrt(np.mean(difference**2)) < 0.01
+
+
+def test_pictures_of_12_bits(tmp_path: Path) -> None:
+    """12 bits in 16-bit files: the response has 4096 codes, and the merge takes it."""
+    radiance, rng = scene(), np.random.default_rng(1)
+    paths = [tmp_path / f"{j}.png" for j in range(len(TIMES))]
+    for path, t in zip(paths, TIMES, strict=True):
+        x = rng.poisson(np.minimum(radiance * t, 2) * 20000) / 20000
+        z = np.round(4095 * np.clip(x, 0, 1) ** (1 / 2.2)).astype(np.uint16)
+        write_picture(path, z)
+    run("hdr", "response", *paths, "--times", LIST, "-o", tmp_path / "r.json")
+    content = json.loads((tmp_path / "r.json").read_text())
+    assert content["codes"] == 4096
+    run(
+        *("hdr", "merge", *paths, "--times", LIST),
+        *("--response", tmp_path / "r.json", "-o", tmp_path / "m.exr"),
+    )
+    pixels = read_image(tmp_path / "m.exr").pixels
+    measured = pixels[..., 3] == 0
+    assert measured.mean() > 0.95
+    ratio = pixels[..., :3] * (2048 / 4095) ** 2.2 / radiance
+    assert np.median(np.abs(ratio[measured] - 1)) < 0.015
+
+
+def test_a_wrong_exposure_is_named_and_mended(
+    bracket: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    times = TIMES.copy()
+    times[3] *= 2
+    wrong = ",".join(f"{t}" for t in times)
+    run("hdr", "response", *bracket, "--times", wrong, "-o", tmp_path / "r.json")
+    assert "frame3.png: its exposure contradicts" in capsys.readouterr().out
+    run(
+        *("hdr", "merge", *bracket, "--times", wrong),
+        *("--response", tmp_path / "r.json", "-o", tmp_path / "m.exr"),
+    )
+    pixels = read_image(tmp_path / "m.exr").pixels
+    measured = pixels[..., 3] == 0
+    ratio = pixels[..., :3] * (128 / 255) ** 2.2 / scene()
+    assert np.median(np.abs(ratio[measured] - 1)) < 0.015
+
+
+def test_merge_does_not_load_jax(bracket: list[Path], tmp_path: Path) -> None:
+    run("hdr", "response", *bracket, "--times", LIST, "-o", tmp_path / "r.json")
+    words = ["hdr", "merge", *bracket, "--times", LIST]
+    words += ["--response", tmp_path / "r.json", "-o", tmp_path / "m.exr"]
+    program = (
+        "import sys\n"
+        "from chromeball.cli.main import build_app\n"
+        f"build_app()({[str(w) for w in words]}, result_action='return_value')\n"
+        "assert 'jax' not in sys.modules\n"
+        "assert 'matplotlib' not in sys.modules\n"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True, capture_output=True)
+
+
 def test_mistakes_are_one_sentence_and_leave_nothing(
     bracket: list[Path], tmp_path: Path
 ) -> None:
@@ -135,7 +213,11 @@ def test_mistakes_are_one_sentence_and_leave_nothing(
         (["response", *bracket[:2], "--times", "1,-1", "-o", out], "positive"),
         (["response", *bracket[:2], "--times", "1,two", "-o", out], "is no exposure time"),
         (["response", white, white, "--times", "1,2", "-o", out], "saturated"),
-        (["response", deep, deep, "--times", "1,2", "-o", out], "8-bit"),
+        (["response", deep, deep, "--times", "1,2", "-o", out], "black"),
+        (
+            ["response", *bracket, "--times", LIST, "--smoothness", "3", "-o", out],
+            "lambda of --method debevec",
+        ),
         (["response", whole, whole, "--times", "1,2", "-o", out], "needs no response"),
         (["merge", *bracket, "--times", LIST, "-o", exr], "need their camera's response"),
         (["merge", nan, nan, "--times", "1,2", "-o", exr], "nan.exr: 16 pixels are NaN"),

@@ -28,7 +28,6 @@ def camera(gamma: float = 2.2, noise: float = 1.0) -> Response:
         channels=known.channels,
         log_exposure=known.log_exposure,
         sigma=known.sigma,
-        weights=known.weights,
         code_noise=np.full(3, noise),
     )
 
@@ -211,7 +210,5 @@ def test_weights_vanish_at_the_ends_and_where_the_curve_is_unknown() -> None:
     unknown = camera()
     sigma = unknown.sigma.copy()
     sigma[:, :40] = 2
-    doubtful = Response(
-        unknown.channels, unknown.log_exposure, sigma, unknown.weights, unknown.code_noise
-    )
+    doubtful = Response(unknown.channels, unknown.log_exposure, sigma, unknown.code_noise)
     assert np.all(weights(doubtful)[:, :40] == 0)

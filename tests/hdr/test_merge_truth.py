@@ -102,9 +102,7 @@ def test_depths_agree() -> None:
     small = Response.from_log_exposure(np.stack([log_exposure()] * 3))
     z = np.arange(65536) / 257
     fine = np.stack([np.interp(z, np.arange(256), g) for g in small.log_exposure])
-    large = Response(
-        small.channels, fine, np.zeros_like(fine), np.ones(65536), small.code_noise * 257
-    )
+    large = Response(small.channels, fine, np.zeros_like(fine), small.code_noise * 257)
     noise = np.full(3, 0.5), np.full(3, 3e-4), np.full(3, 1e-6)
     c = merge_frames(
         frames, TIMES, small, tables=code_weights(small, CodeNoise(*noise)), sigma=True

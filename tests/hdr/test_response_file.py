@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -9,17 +10,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from chromeball.hdr.plots import plot_comparagrams, plot_response
+from chromeball.hdr.response import sample, solve
 from chromeball.hdr.response_file import (
     Exposed,
     Response,
     encode_response,
     exposures_for,
     parse_response,
-    plot_response,
     read_response,
 )
 from chromeball.scene.errors import UserError
-from tests.hdr.camera import log_exposure
+from tests.hdr.camera import TIMES, log_exposure, photograph, scene
 
 
 def curve() -> Response:
@@ -28,7 +30,6 @@ def curve() -> Response:
         known.channels,
         known.log_exposure,
         np.full((3, 256), 0.01),
-        known.weights,
         np.array([1.0, 1.1, 1.2]),
         refined=True,
         exposures=(Exposed("a.jpg", 1.0, 1.05), Exposed("b.jpg", 0.5, 0.5)),
@@ -63,14 +64,15 @@ def test_refined_exposures_serve_frames_of_the_same_nominal_one() -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"codes": 1024}, "1024 codes"),
+        ({"codes": 1000}, "1000 codes"),
+        ({"codes": 1024}, "needs 3 x 1024"),
         ({"log_exposure": [[0.0] * 256] * 3}, "does not rise at code 1"),
         ({"log_exposure": [list(np.arange(256.0))] * 3}, "not zero at code 128"),
         ({"log_exposure": [list(np.arange(256.0) - 128)] * 3}, "spans"),
         ({"log_exposure": [[0.0] * 255] * 3}, "needs 3 x 256"),
         ({"sigma": [[-1.0] * 256] * 3}, "negative"),
         ({"channels": ["R", "R", "B"]}, "one name"),
-        ({"version": 2}, "version 2"),
+        ({"version": 1}, "version 1"),
         ({"surprise": 1}, "surprise"),
         ({"channels": 3}, "channels"),
     ],
@@ -113,6 +115,34 @@ def test_any_value_for_any_key_is_read_or_refused(key: str, value: object) -> No
     assert np.all(np.diff(response.log_exposure, axis=1) > 0)
 
 
-def test_plot_is_a_picture(tmp_path: Path) -> None:
+def test_two_frames_of_one_nominal_exposure_are_told_apart_by_name() -> None:
+    response = curve()
+    rows = (Exposed("a.jpg", 1.0, 1.05), Exposed("b.jpg", 1.0, 2.1))
+    response = dataclasses.replace(response, exposures=rows)
+    used, found = exposures_for(
+        response, np.array([1.0, 1.0, 1.0]), ["b.jpg", "a.jpg", "c.jpg"]
+    )
+    assert found == 2
+    np.testing.assert_allclose(used, [2.1, 1.05, 1.0])
+
+
+def test_a_response_of_16_bits_goes_round(tmp_path: Path) -> None:
+    z = np.maximum(np.arange(65536), 0.5)
+    known = Response.from_log_exposure(2.2 * np.log(z / 32768)[None])
+    path = tmp_path / "response.json"
+    path.write_bytes(encode_response(known))
+    again = read_response(path)
+    assert again.codes == 65536
+    np.testing.assert_array_equal(again.log_exposure, known.log_exposure)
+    assert path.stat().st_size < 4e6
+
+
+def test_plots_are_pictures(tmp_path: Path) -> None:
+    frames = photograph(scene(96, 128))
+    samples = [sample(f) for f in frames]
+    found = solve(samples, TIMES)
+    paths = [Path(f"{t}.png") for t in TIMES]
+    plot_comparagrams(samples, found, paths, tmp_path / "pairs.png")
     plot_response(strict(), tmp_path / "plot.png")
-    assert (tmp_path / "plot.png").read_bytes().startswith(b"\x89PNG")
+    for name in ("pairs.png", "plot.png"):
+        assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
