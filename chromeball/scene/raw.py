@@ -249,23 +249,22 @@ def develop_sigma(
         "G": np.array([[0, _GREEN / 4, 0], [_GREEN / 4, 1, _GREEN / 4], [0, _GREEN / 4, 0]])
     }
     weights["R"] = weights["B"] = np.array([[c, e, c], [e, 1, e], [c, e, c]])
-    planes: list[NDArray[np.float64]] = []
+    planes: list[NDArray[np.float32]] = []
     for letter, multiplier in zip("RGB", multipliers, strict=True):
-        own = variance * tiled(letters == letter, sigma.shape) * multiplier**2
+        own = variance * tiled((letters == letter) * multiplier**2, sigma.shape)
         plane = cv2.filter2D(own, -1, weights[letter], borderType=cv2.BORDER_REFLECT_101)
-        planes.append(np.asarray(plane, np.float64))
-    each = np.sqrt(np.stack(planes, axis=2))
+        planes.append(np.asarray(plane, np.float32))
     if space == "camera":
-        total = each**2
+        total = np.stack(planes, axis=2)
     else:
-        matrix = _matrix(info, space)
-        total = np.stack(
-            [
-                np.einsum("hwj,jk,hwk->hw", each, _CORRELATION * np.outer(row, row), each)
-                for row in matrix
-            ],
-            axis=2,
-        )
+        # rows . diag(s) C diag(s) . rows: six products of s, three of them squares
+        r, g, b = (np.sqrt(plane) for plane in planes)
+        products = np.stack([*planes, r * g, r * b, g * b], axis=2)
+        m = _matrix(info, space)
+        first, second = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]
+        twice = np.array([1, 1, 1, 2, 2, 2])
+        total = products @ (m[:, first] * m[:, second] * _CORRELATION[first, second] * twice).T
+        total = np.maximum(total, 0)
     total[touched(bound)] = np.inf
     return np.sqrt(total).astype(np.float32)
 
