@@ -27,7 +27,7 @@ from chromeball.hdr.noise import (
     measure_linear,
     unsaturated,
 )
-from chromeball.hdr.preview import Preview
+from chromeball.hdr.preview import Glance, Preview
 from chromeball.hdr.response_file import Response
 from chromeball.hdr.select import choose
 from chromeball.hdr.stream import Frames
@@ -147,8 +147,8 @@ def write_merged(
     *,
     sigma: bool,
     attributes: Mapping[str, Any],
-) -> tuple[dict[str, Any], NDArray[np.uint8]]:
-    """Merge band after band into an EXR; figures of it, and its preview.
+) -> tuple[dict[str, Any], Glance]:
+    """Merge band after band into an EXR; figures of it, and how it looks at a glance.
 
     Raises
     ------
@@ -177,7 +177,7 @@ def write_merged(
             append(
                 np.concatenate([*planes, part.clipped[..., None].astype(np.float32)], axis=2)
             )
-            preview.add(top, part.radiance)
+            preview.add(top, part.radiance, part.clipped, stride)
             some = slice(-top % stride, None, stride), slice(None, None, stride)
             keep = part.clipped[some] == 0
             measured.append(part.radiance[some][keep])

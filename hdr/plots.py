@@ -1,4 +1,4 @@
-"""Pictures of a response: the curve with its band, D log E, residuals, comparagrams."""
+"""Plots: a response with its band, D log E, residuals, comparagrams; a map's histogram."""
 
 from __future__ import annotations
 
@@ -13,11 +13,13 @@ from numpy.typing import NDArray
 from chromeball.hdr import kernel
 from chromeball.hdr.comparagram import pair
 from chromeball.hdr.knots import coordinate
+from chromeball.hdr.preview import Glance
 from chromeball.hdr.response import BRIGHT_ENOUGH, UNCHANGING, Sample, Solution
 from chromeball.hdr.response_file import Response
 
 type Float = NDArray[np.float64]
 
+HIGH, LOW = (0.85, 0.2, 0.15), (0.2, 0.35, 0.85)
 COLORS = {"R": "#c0392b", "G": "#27853d", "B": "#2c5fa8"}
 
 
@@ -81,6 +83,47 @@ def _per_exposure(axes: Any, response: Response) -> None:
     axes.set_xticks(at, [f"{row['given']:.3g}" for row in rows], rotation=60, fontsize=7)  # pyright: ignore[reportUnknownVariableType]
     axes.set(xlabel="exposure as given", ylabel="stops", title="exposures")
     axes.legend(frameon=False, fontsize=8)
+
+
+def plot_radiance(
+    glance: Glance, channels: Sequence[str], path: str | os.PathLike[str]
+) -> None:
+    """Draw the histogram in stops and where no frame measured, PNG."""
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Patch
+
+    height, width = glance.clipped.shape
+    figure = Figure(figsize=(11, 4.2), layout="constrained")
+    histogram, clipped = figure.subplots(1, 2)
+    used = np.flatnonzero(glance.histogram.sum(axis=0))
+    first, last = (int(used[0]), int(used[-1]) + 1) if used.size else (0, 1)
+    for name, counts in zip(channels, glance.histogram, strict=True):
+        share = 100 * counts[first:last] / max(1, counts.sum())
+        edges = glance.edges[first : last + 1]
+        histogram.stairs(share, edges, color=COLORS.get(name, "#444444"), lw=1.3, label=name)
+    histogram.set(
+        xlabel="log2 radiance (stops)", ylabel="% of the measured pixels a bin", title="histogram"
+    )
+    histogram.legend(frameon=False)
+    histogram.grid(alpha=0.3)
+    grey = glance.picture.mean(axis=2, keepdims=True).repeat(3, axis=2) / 255 * 0.8
+    grey[glance.clipped == 1] = HIGH
+    grey[glance.clipped == -1] = LOW
+    clipped.imshow(grey, extent=(0, width, height, 0), interpolation="nearest")
+    clipped.set_axis_off()
+    clipped.set_title("where no frame measured a channel")
+    clipped.legend(
+        handles=[
+            Patch(color=HIGH, label="saturated in all: lower bound"),
+            Patch(color=LOW, label="black in all: upper bound"),
+        ],
+        loc="lower center",
+        bbox_to_anchor=(0.5, -0.14),
+        ncols=2,
+        frameon=False,
+        fontsize=8,
+    )
+    figure.savefig(path, dpi=110, format="png", metadata={"Software": None})
 
 
 def plot_comparagrams(

@@ -163,6 +163,7 @@ def merge(
 ) -> None:
     """Merge a bracket into a scene-linear EXR; clipped pixels are marked and counted."""
     from chromeball.hdr.bracket import Picture, read_bracket
+    from chromeball.hdr.plots import plot_radiance
     from chromeball.hdr.merge_files import prepare_codes, prepare_linear, write_merged
     from chromeball.hdr.response_file import exposures_for, read_response
     from chromeball.hdr.stream import Frames
@@ -237,11 +238,13 @@ def merge(
             attributes["cameraModel"] = cameras.pop()
         picture_path = output.with_name(output.stem + ".preview.png")
         with stage.output(output) as temporary:
-            figures, preview = write_merged(
+            figures, glance = write_merged(
                 temporary, frames, exposures, prepared, sigma=sigma, attributes=attributes
             )
         with stage.output(picture_path) as temporary:
-            write_picture(temporary, preview)
+            write_picture(temporary, glance.picture)
+        with stage.output(_beside(output, "histogram")) as temporary:
+            plot_radiance(glance, frames.channels, temporary)
         stage.figures |= {
             "channels": frames.channels,
             "pictures": len(used),
@@ -252,6 +255,7 @@ def merge(
             **prepared.figures,
             **figures,
             "preview": picture_path.name,
+            "histogram": _beside(output, "histogram").name,
         }
     _report(
         output,
