@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from chromeball.hdr.bracket import Bracket, Picture, mosaics
+from chromeball.hdr.exposure import Luminance, luminance_scale
 from chromeball.hdr.merge import (
     SATURATED,
     SENSOR_NOISE,
@@ -33,6 +35,7 @@ from chromeball.hdr.select import choose
 from chromeball.hdr.stream import Frames
 from chromeball.scene.errors import UserError
 from chromeball.scene.image import exr_rows
+from chromeball.scene.raw import Balance, Mosaic, develop, develop_sigma, tiled, touched
 
 type Float = NDArray[np.float64]
 type Merge = Callable[[Sequence[NDArray[Any]], Float], Radiance]
@@ -109,8 +112,34 @@ def prepare_linear(
     if not white > 0:
         raise UserError("all pictures are black: take longer exposures")
     order = np.argsort(exposures, kind="stable")
-    t = exposures[order][:, None, None]
     x = np.stack([frames.samples[j].values for j in order]) / np.float64(white)
+    prepared = _prepare_shares(frames, exposures, x, noise, snr)
+    model, top = prepared.noise, float(white)
+
+    def merge(rows: Sequence[NDArray[Any]], times: Float) -> Radiance:
+        return merge_linear(rows, times, white=top, noise=model, sigma=sigma)
+
+    figures = prepared.figures | {"white": white}
+    return Prepared(prepared.chosen, merge, _idle(frames, SATURATED * top), figures)
+
+
+@dataclass(frozen=True)
+class _Shares:
+    chosen: tuple[int, ...]
+    noise: Float  # (C, 2)
+    figures: dict[str, Any]
+
+
+def _prepare_shares(
+    frames: Frames,
+    exposures: Float,
+    x: Float,
+    noise: tuple[float, float] | None,
+    snr: float | None,
+) -> _Shares:
+    """Noise and choice of frames from samples x (P, N, C), shares of white, sorted."""
+    order = np.argsort(exposures, kind="stable")
+    t = exposures[order][:, None, None]
     usable = unsaturated(x, SATURATED)
     origin, model = "--noise", np.broadcast_to(noise or SENSOR_NOISE, (x.shape[2], 2))
     if noise is None:
@@ -130,25 +159,164 @@ def prepare_linear(
     fit = chi_square(x / t, variance, usable)
     information = np.where(usable, level**2 / variance, 0)
     chosen, figures = _chosen(frames, order, information, snr)
-    figures |= {"noise_from": origin, "noise": model, "white": white, **_fit_figures(fit)}
-    top = float(white)
+    return _Shares(
+        chosen,
+        model,
+        figures | {"noise_from": origin, "noise": model, **_fit_figures(fit)},
+    )
+
+
+@dataclass
+class Sensor:
+    """A RAW bracket as pictures of one channel, for :class:`Frames`; what they have in common.
+
+    ``first`` is the first frame's mosaic, ``white`` the lowest level that any frame shows.
+    """
+
+    first: Mosaic | None = None
+    white: Float = field(default_factory=lambda: np.full((2, 2), np.inf))
+
+    def pictures(self, bracket: Bracket, tell: Callable[[str], None]) -> Iterator[Picture]:
+        """Sensor values (H, W, 1) of frame after frame."""
+        for path, mosaic in zip(bracket.paths, mosaics(bracket, tell), strict=True):
+            self.first = self.first or mosaic
+            self.white = np.minimum(self.white, mosaic.white)
+            yield Picture(path, mosaic.pixels[..., None], ("sensor",), linear=True)
+
+    @property
+    def info(self) -> Mosaic:
+        """The first frame's mosaic, with the white of all."""
+        if self.first is None:
+            raise ValueError("no frame was read")
+        return replace(self.first, white=self.white)
+
+
+def prepare_sensor(
+    frames: Frames,
+    exposures: Float,
+    info: Mosaic,
+    *,
+    noise: tuple[float, float] | None,
+    sigma: bool,
+    snr: float | None,
+) -> Prepared:
+    """As :func:`prepare_linear`, for a Bayer sensor's values; radiance in shares of white."""
+    shape = info.pixels.shape
+    rows, columns = frames.lattice
+    dark, scale = (
+        tiled(cell, shape)[rows, columns].reshape(-1, 1)
+        for cell in (info.black, info.white - info.black)
+    )
+    order = np.argsort(exposures, kind="stable")
+    x = np.stack([(frames.samples[j].values - dark) / scale for j in order])
+    prepared = _prepare_shares(frames, exposures, x, noise, snr)
+    model = prepared.noise[0]
+    levels = info.white - info.black
 
     def merge(rows: Sequence[NDArray[Any]], times: Float) -> Radiance:
-        return merge_linear(rows, times, white=top, noise=model, sigma=sigma)
+        merged = merge_linear(
+            rows, times, black=info.black, white=info.white, noise=model, sigma=sigma
+        )
+        share = tiled((1 / levels).astype(np.float32), merged.radiance.shape[:2])[..., None]
+        return replace(
+            merged,
+            radiance=merged.radiance * share,
+            sigma=None if merged.sigma is None else merged.sigma * share,
+        )
 
-    return Prepared(chosen, merge, _idle(frames, SATURATED * top), figures)
+    saturated = float((info.black + SATURATED * levels).min())
+    figures = prepared.figures | {
+        "black": info.black,
+        "white": info.white,
+        "white_from": "metadata" if np.all(info.white == info.stated_white) else "pixels",
+        "pattern": "".join(info.pattern),
+    }
+    return Prepared(prepared.chosen, merge, _idle(frames, saturated), figures)
+
+
+def developed(
+    frames: Frames,
+    exposures: Float,
+    prepared: Prepared,
+    info: Mosaic,
+    white_balance: Balance,
+) -> tuple[Radiance, dict[str, Any]]:
+    """A RAW bracket merged as its sensor's mosaic and then developed, once; and figures of it.
+
+    Values that the demosaic touches a saturated one for are marked as bounds. Colours outside
+    Rec.709 are negative and kept.
+    """
+    shape = frames.shape[:2]
+    mosaic, clipped = np.empty(shape, np.float32), np.empty(shape, np.int8)
+    error: NDArray[np.float32] | None = None
+    for top, part in merge_bands(frames, exposures, prepared):
+        end = top + len(part.radiance)
+        mosaic[top:end], clipped[top:end] = part.radiance[..., 0], part.clipped
+        if part.sigma is not None:
+            error = np.empty(shape, np.float32) if error is None else error
+            error[top:end] = part.sigma[..., 0]
+    for mark, word, wish in ((1, "saturated", "shorter"), (-1, "black", "longer")):
+        if np.all(clipped == mark):
+            raise UserError(f"every pixel is {word} in all pictures: take {wish} exposures")
+    space: Literal["rec709", "camera"] = "rec709" if info.matrix is not None else "camera"
+    rgb = develop(mosaic, info, white_balance, space)
+    bound = touched(clipped == 1)
+    dark = clipped == -1
+    marks = np.where(bound, 1, np.where(dark, -1, 0)).astype(np.int8)
+    letters = np.array([list(row) for row in info.pattern])
+    counts = [
+        [int((tiled(letters == letter, shape) & (clipped == mark)).sum()) for letter in "RGB"]
+        for mark in (1, -1)
+    ]
+    multipliers = info.multipliers(white_balance)
+    return Radiance(
+        radiance=rgb,
+        sigma=None if error is None else develop_sigma(error, info, white_balance, space),
+        clipped=marks,
+        high=np.array(counts[0]),
+        low=np.array(counts[1]),
+        negative=(rgb < 0).sum(axis=(0, 1)),
+    ), {
+        "white_balance": multipliers,
+        "white_balance_from": white_balance if isinstance(white_balance, str) else "given",
+        "colour_space": space,
+    }
+
+
+def merge_bands(
+    frames: Frames, exposures: Float, prepared: Prepared
+) -> Iterator[tuple[int, Radiance]]:
+    """(first row, radiance) of band after band, from the top."""
+    times = exposures[list(prepared.chosen)]
+    for top, rows in frames.bands(prepared.chosen):
+        yield top, prepared.merge(rows, times)
+
+
+def scaled(part: Radiance, factor: float) -> Radiance:
+    """The part in other units."""
+    if factor == 1:
+        return part
+    f = np.float32(factor)
+    return replace(
+        part,
+        radiance=part.radiance * f,
+        sigma=None if part.sigma is None else part.sigma * f,
+    )
 
 
 def write_merged(
     path: Path,
-    frames: Frames,
-    exposures: Float,
-    prepared: Prepared,
+    size: tuple[int, int],
+    channels: Sequence[str],
+    parts: Iterable[tuple[int, Radiance]],
     *,
     sigma: bool,
     attributes: Mapping[str, Any],
 ) -> tuple[dict[str, Any], Glance]:
-    """Merge band after band into an EXR; figures of it, and how it looks at a glance.
+    """Write bands (first row, radiance) to an EXR; figures of it, and how it looks at a glance.
+
+    `size` is width and height.
+
 
     Raises
     ------
@@ -156,21 +324,19 @@ def write_merged(
         When no pixel of a channel, whichever, is measured.
 
     """
-    height, width, _ = frames.shape
-    names = [*frames.channels]
+    width, height = size
+    names = [*channels]
     if sigma:
-        names += [f"sigma.{name}" for name in frames.channels]
+        names += [f"sigma.{name}" for name in channels]
     names.append("clipped")
-    times = exposures[list(prepared.chosen)]
     preview = Preview(height, width)
     stride = max(1, int(np.sqrt(height * width / _STATISTICS)))
-    high, low, negative = (np.zeros(len(frames.channels), np.int64) for _ in range(3))
+    high, low, negative = (np.zeros(len(channels), np.int64) for _ in range(3))
     clipped = 0
     measured: list[NDArray[np.float32]] = []
     relative: list[NDArray[np.float32]] = []
     with exr_rows(path, (width, height), channels=names, attributes=attributes) as append:
-        for top, rows in frames.bands(prepared.chosen):
-            part = prepared.merge(rows, times)
+        for top, part in parts:
             high, low, negative = high + part.high, low + part.low, negative + part.negative
             clipped += int(np.count_nonzero(part.clipped))
             planes = [part.radiance, *([] if part.sigma is None else [part.sigma])]
@@ -239,3 +405,31 @@ def _fit_figures(fit: Fit) -> dict[str, Any]:
         "chi_square_by_range": fit.by_range,
         "outliers": fit.outliers,
     }
+
+
+def read_luminance(
+    frames: Frames,
+    exposures: Float,
+    prepared: Prepared,
+    place: Sequence[int],
+    luminance: float,
+    whole: Radiance | None = None,
+) -> Luminance:
+    """Calibrate by a reading of `luminance` cd/m^2 at `place`, x, y or x, y, width, height.
+
+    `whole` is the merged picture where it is at hand; else the rows of the place are merged.
+    """
+    height, width, _ = frames.shape
+    x, y, across, down = place if len(place) == 4 else (place[0] - 3, place[1] - 3, 7, 7)
+    if x < 0 or y < 0 or x + across > width or y + down > height or across < 1 or down < 1:
+        raise UserError(
+            f"the measured place, {across} x {down} pixels at x {x}, y {y}, is not in the "
+            f"picture of {width} x {height}"
+        )
+    part, top = whole, 0
+    if part is None:
+        rows = frames.part(prepared.chosen, y, y + down)
+        part, top = prepared.merge(rows, exposures[list(prepared.chosen)]), y
+    return luminance_scale(
+        part.radiance, (x, y - top, across, down), luminance, clipped=part.clipped != 0
+    )

@@ -102,7 +102,9 @@ def plot_radiance(
         edges = glance.edges[first : last + 1]
         histogram.stairs(share, edges, color=COLORS.get(name, "#444444"), lw=1.3, label=name)
     histogram.set(
-        xlabel="log2 radiance (stops)", ylabel="% of the measured pixels a bin", title="histogram"
+        xlabel="log2 radiance (stops)",
+        ylabel="% of the measured pixels a bin",
+        title="histogram",
     )
     histogram.legend(frameon=False)
     histogram.grid(alpha=0.3)

@@ -9,14 +9,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-
 #: bins of the histogram per stop, and the stops it reaches over and under 1
 BINS_PER_STOP, STOPS = 8, 48
 
 
 @dataclass(frozen=True)
 class Glance:
-    """``picture`` (h, w, 3) tone-mapped; ``clipped`` (h, w) int8: 1 where a pixel of the cell is
+    """What :class:`Preview` gathers.
+
+    ``picture`` (h, w, 3) tone-mapped; ``clipped`` (h, w) int8: 1 where a pixel of the cell is
     saturated in all frames, else -1 where one is black in all; ``histogram`` (C, bins) of the
     measured values, ``edges`` (bins + 1,) in stops.
     """
@@ -43,7 +44,7 @@ class Preview:
     def add(
         self, top: int, rows: NDArray[np.float32], clipped: NDArray[np.int8], stride: int
     ) -> None:
-        """Add rows (h, W, C) and their marks (h, W), the first of them row `top` of the picture.
+        """Add rows (h, W, C) and their marks (h, W), the first of them row `top`.
 
         Every `stride`-th pixel counts in the histogram.
         """

@@ -56,6 +56,7 @@ class Frames:
 
     bracket: Bracket
     tell: Callable[[str], None]
+    read: Callable[[Bracket, Callable[[str], None]], Iterator[Picture]] = pictures
     check: Callable[[Picture], None] = lambda picture: None
     memory: int = MEMORY
     spool: Path | None = None
@@ -71,7 +72,7 @@ class Frames:
         self._files = 0
         room = self.memory
         try:
-            for picture in pictures(self.bracket, self.tell):
+            for picture in self.read(self.bracket, self.tell):
                 self.check(picture)
                 pixels = picture.pixels
                 if not self._rows:
@@ -110,6 +111,15 @@ class Frames:
                 end = min(height, top + step)
                 rows = [self._rows[j] for j in chosen]
                 yield top, list(pool.map(lambda read: read(top, end), rows))  # noqa: B023
+
+    @property
+    def lattice(self) -> tuple[slice, slice]:
+        """Rows and columns that the samples are of."""
+        return _lattice(self.shape[:2], len(self.bracket.paths))
+
+    def part(self, chosen: Sequence[int], top: int, end: int) -> list[NDArray[Any]]:
+        """The rows `top` .. `end` of the chosen frames."""
+        return [self._rows[j](top, end) for j in chosen]
 
     def _reader(self, picture: Picture) -> Rows:
         import OpenImageIO as oiio
@@ -150,10 +160,13 @@ def _held(pixels: NDArray[Any]) -> Rows:
 
 
 def _sample(pixels: NDArray[Any], frames: int) -> Sampled:
-    count = min(_MOST, max(_FEWEST, _SAMPLES // frames))
-    rows, columns = lattice((pixels.shape[0], pixels.shape[1]), count)
+    rows, columns = _lattice((pixels.shape[0], pixels.shape[1]), frames)
     values = pixels[rows, columns].reshape(-1, pixels.shape[2]).copy()
     return Sampled(values, pixels.min(axis=(0, 1)), pixels.max(axis=(0, 1)))
+
+
+def _lattice(shape: tuple[int, int], frames: int) -> tuple[slice, slice]:
+    return lattice(shape, min(_MOST, max(_FEWEST, _SAMPLES // frames)))
 
 
 def _by_rows(path: Path) -> bool:

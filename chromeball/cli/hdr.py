@@ -21,6 +21,10 @@ type Times = Annotated[
     str | None,
     Parameter(help="Exposure times in seconds, 1/30,1/60,...; else from takes or metadata."),
 ]
+type Filters = Annotated[
+    str | None,
+    Parameter(help="Neutral-density filters in stops: one for all pictures, or 0,0,3,..."),
+]
 type Output = Annotated[Path, Parameter(name=["--output", "-o"], help="Output file.")]
 type AsJson = Annotated[bool, Parameter(name="--json", negative="", help="Figures as JSON.")]
 
@@ -41,6 +45,7 @@ def response(
     *,
     output: Output,
     times: Times = None,
+    nd: Filters = None,
     method: Annotated[
         Literal["comparagram", "debevec"],
         Parameter(help="With a prior over real curves; or Debevec and Malik as published."),
@@ -75,7 +80,8 @@ def response(
 
     if method != "debevec" and smoothness is not None:
         raise UserError("--smoothness is lambda of --method debevec: leave it out")
-    bracket = read_bracket(inputs, parse_times(times))
+    bracket = read_bracket(inputs, parse_times(times), parse_stops(nd))
+    _notes(bracket.notes)
     stored = read_response(reuse) if reuse is not None and reuse.is_file() else None
     if reuse is not None and stored is None:
         _tell(f"{reuse}: no stored response; solving one")
@@ -84,6 +90,7 @@ def response(
         "hdr response",
         inputs=[*bracket.inputs, *([reuse] if reuse is not None and stored else [])],
         times=times,
+        nd=nd,
         method=method,
         smoothness=smoothness,
         patch=patch,
@@ -136,6 +143,7 @@ def merge(
     *,
     output: Output,
     times: Times = None,
+    nd: Filters = None,
     response: Annotated[
         Path | None, Parameter(help="response.json of the camera; needed unless linear.")
     ] = None,
@@ -143,7 +151,8 @@ def merge(
         bool, Parameter(negative="", help="Add channels with standard errors.")
     ] = False,
     white: Annotated[
-        float | None, Parameter(help="Value of a saturated pixel in linear pictures.")
+        float | None,
+        Parameter(help="Value of a saturated pixel in linear pictures other than RAW."),
     ] = None,
     noise: Annotated[
         tuple[float, float] | None,
@@ -152,29 +161,73 @@ def merge(
             "from the bracket unless given."
         ),
     ] = None,
+    white_balance: Annotated[
+        str | None,
+        Parameter(help="RAW: camera (default), daylight, none, or three multipliers r,g,b."),
+    ] = None,
     snr: Annotated[
         float | None,
         Parameter(help="Leave out exposures not needed for this signal-to-noise ratio."),
+    ] = None,
+    luminance: Annotated[
+        float | None, Parameter(help="Light-meter reading in cd/m^2 of the place --at.")
+    ] = None,
+    grey_card: Annotated[
+        tuple[float, float] | None,
+        Parameter(help="Reflectance of a grey card --at the place, and illuminance in lux."),
+    ] = None,
+    at: Annotated[
+        str | None, Parameter(help="The metered place in pixels: x,y or x,y,width,height.")
+    ] = None,
+    scale_from: Annotated[
+        Path | None,
+        Parameter(help="A map of the same session in cd/m^2: its scale serves this one too."),
     ] = None,
     memory: Annotated[
         float, Parameter(help="Gigabytes of frames to keep in memory; others are read twice.")
     ] = 1.0,
     as_json: AsJson = False,
 ) -> None:
-    """Merge a bracket into a scene-linear EXR; clipped pixels are marked and counted."""
-    from chromeball.hdr.bracket import Picture, read_bracket
+    """Merge a bracket into a scene-linear EXR; clipped pixels are marked and counted.
+
+    RAW brackets are merged as sensor values and developed once.
+    """
+    from chromeball.hdr.bracket import Picture, pictures, read_bracket
+    from chromeball.hdr.merge_files import (
+        Sensor,
+        developed,
+        merge_bands,
+        prepare_codes,
+        prepare_linear,
+        prepare_sensor,
+        read_luminance,
+        scaled,
+        write_merged,
+    )
     from chromeball.hdr.plots import plot_radiance
-    from chromeball.hdr.merge_files import prepare_codes, prepare_linear, write_merged
     from chromeball.hdr.response_file import exposures_for, read_response
     from chromeball.hdr.stream import Frames
-    from chromeball.scene.image import write_picture
+    from chromeball.scene.image import NEGATIVE_MEANING, write_picture
+    from chromeball.scene.raw import no_bayer
 
     if output.suffix.lower() != ".exr":
         raise UserError("a radiance map is written as .exr", file=output)
     if not (memory >= 0):
         raise UserError(f"--memory {memory:g}: give gigabytes, 0 or more")
-    bracket = read_bracket(inputs, parse_times(times))
+    reading = _reading(luminance, grey_card, at, scale_from)
+    bracket = read_bracket(inputs, parse_times(times), parse_stops(nd))
+    _notes(bracket.notes)
+    balance = _balance(white_balance)
+    odd = no_bayer(bracket.paths[0]) if bracket.raw else None
+    if odd:
+        _tell(f"{bracket.paths[0].name} is no Bayer mosaic ({odd}): merging LibRaw's pictures")
+    sensor = Sensor() if bracket.raw and not odd else None
+    if balance is not None and sensor is None:
+        raise UserError("--white-balance is for RAW pictures of a Bayer sensor: leave it out")
+    if bracket.raw and white is not None:
+        raise UserError("RAW pictures say what is white: leave --white out")
     curve = None if response is None else read_response(response)
+    known_scale = None if scale_from is None else _scale_of(scale_from, bracket.scale)
     exposures, refined = bracket.exposures, 0
     if curve is not None:
         names = [path.name for path in bracket.paths]
@@ -200,18 +253,41 @@ def merge(
     with (
         Stage(
             "hdr merge",
-            inputs=[*bracket.inputs, *([] if response is None else [response])],
+            inputs=[
+                *bracket.inputs,
+                *(path for path in (response, scale_from) if path is not None),
+            ],
             times=times,
+            nd=nd,
             sigma=sigma,
             white=white,
             noise=noise,
+            white_balance=white_balance,
             snr=snr,
+            luminance=luminance,
+            grey_card=grey_card,
+            at=at,
         ) as stage,
         Frames(
-            bracket, _tell, check, memory=int(memory * 2**30), spool=output.parent
+            bracket,
+            _tell,
+            sensor.pictures if sensor else pictures,
+            check,
+            memory=int(memory * 2**30),
+            spool=output.parent,
         ) as frames,
     ):
-        if curve is None:
+        whole = None
+        channels = frames.channels
+        if sensor is not None:
+            info = sensor.info
+            channels = ("R", "G", "B")
+            prepared = prepare_sensor(
+                frames, exposures, info, noise=noise, sigma=sigma, snr=snr
+            )
+            whole, found = developed(frames, exposures, prepared, info, balance or "camera")
+            stage.figures |= found
+        elif curve is None:
             prepared = prepare_linear(
                 frames, exposures, white=white, noise=noise, sigma=sigma, snr=snr
             )
@@ -236,27 +312,50 @@ def merge(
         }
         if len(cameras) == 1:
             attributes["cameraModel"] = cameras.pop()
-        picture_path = output.with_name(output.stem + ".preview.png")
+        if whole is not None and whole.negative.any():
+            attributes[NEGATIVE_MEANING] = "noise, and colours outside Rec.709"
+        if "white_balance" in stage.figures:
+            attributes["whiteBalance"] = stage.figures["white_balance"]
+        factor = known_scale or 1.0
+        if reading is not None:
+            place, cd = reading
+            meter = read_luminance(frames, exposures, prepared, place, cd, whole)
+            factor = meter.scale
+            stage.figures |= {"luminance_error": meter.error, "metered_pixels": meter.pixels}
+        if reading is not None or known_scale is not None:
+            attributes |= {"whiteLuminance": 1.0, "luminanceScale": factor}
+            stage.figures["luminance_scale"] = factor
+        parts = (
+            merge_bands(frames, exposures, prepared) if whole is None else iter([(0, whole)])
+        )
+        size = frames.shape[1], frames.shape[0]
         with stage.output(output) as temporary:
             figures, glance = write_merged(
-                temporary, frames, exposures, prepared, sigma=sigma, attributes=attributes
+                temporary,
+                size,
+                channels,
+                ((top, scaled(part, factor)) for top, part in parts),
+                sigma=sigma,
+                attributes=attributes,
             )
-        with stage.output(picture_path) as temporary:
+        with stage.output(_beside(output, "preview")) as temporary:
             write_picture(temporary, glance.picture)
         with stage.output(_beside(output, "histogram")) as temporary:
-            plot_radiance(glance, frames.channels, temporary)
+            plot_radiance(glance, channels, temporary)
         stage.figures |= {
-            "channels": frames.channels,
+            "channels": channels,
             "pictures": len(used),
-            "size": [frames.shape[1], frames.shape[0]],
+            "size": size,
             "exposure_scale": bracket.scale,
             "refined_exposures": refined,
             "measure_nothing": {names[j]: why for j, why in prepared.idle.items()},
+            "notes": bracket.notes,
             **prepared.figures,
             **figures,
-            "preview": picture_path.name,
+            "preview": _beside(output, "preview").name,
             "histogram": _beside(output, "histogram").name,
         }
+    unit = "" if "luminance_scale" not in stage.figures else ", values in cd/m^2"
     _report(
         output,
         as_json,
@@ -266,9 +365,81 @@ def merge(
             f"low {_each(figures['clipped_low'])}",
             f"noise from {prepared.figures['noise_from']}, "
             f"chi-square {_each(prepared.figures['chi_square'], '.2f')}",
-            f"exposure scale {bracket.scale}",
+            f"exposure scale {bracket.scale}{unit}",
         ],
     )
+
+
+def parse_stops(text: str | None) -> list[float]:
+    """``3`` or ``0,0,3`` -> stops of neutral-density filters."""
+    if text is None:
+        return []
+    try:
+        return [float(part) for part in text.split(",")]
+    except ValueError as error:
+        raise UserError(f"--nd {text}: give stops, 3 or 0,0,3") from error
+
+
+def _balance(text: str | None) -> Any:
+    if text is None or text in ("camera", "daylight", "none"):
+        return text
+    try:
+        r, g, b = (float(part) for part in text.split(","))
+    except ValueError as error:
+        raise UserError(
+            f"--white-balance {text}: camera, daylight, none or three multipliers r,g,b"
+        ) from error
+    return r, g, b
+
+
+def _reading(
+    luminance: float | None,
+    card: tuple[float, float] | None,
+    at: str | None,
+    scale_from: Path | None,
+) -> tuple[tuple[int, ...], float] | None:
+    """The metered place and its luminance in cd/m^2, or None."""
+    from chromeball.hdr.exposure import grey_card
+
+    given = sum(option is not None for option in (luminance, card, scale_from))
+    if given > 1:
+        raise UserError("--luminance, --grey-card and --scale-from say one thing: give one")
+    if (luminance is not None or card is not None) != (at is not None):
+        raise UserError("a reading needs --luminance or --grey-card, and its place --at")
+    if at is None:
+        return None
+    try:
+        place = tuple(int(part) for part in at.split(","))
+    except ValueError as error:
+        raise UserError(f"--at {at}: whole pixels x,y or x,y,width,height") from error
+    if len(place) not in (2, 4):
+        raise UserError(f"--at {at}: give x,y or x,y,width,height")
+    if luminance is not None:
+        return place, luminance
+    assert card is not None
+    return place, grey_card(*card)
+
+
+def _scale_of(path: Path, scale: str) -> float:
+    """The factor to cd/m^2 of a map of the same session."""
+    from chromeball.scene.image import read_header
+
+    attributes = read_header(path).attributes
+    factor = attributes.get("luminanceScale")
+    if not isinstance(factor, float):
+        raise UserError("this map is not in cd/m^2: merge it with --luminance", file=path)
+    if attributes.get("exposureScale") != scale:
+        raise UserError(
+            f"its exposures are {attributes.get('exposureScale')}, those of the pictures "
+            f"{scale}: one scale cannot serve both",
+            file=path,
+        )
+    return factor
+
+
+def _notes(notes: tuple[str, ...]) -> None:
+    for note in notes:
+        _tell(note)
 
 
 def _beside(output: Path, what: str) -> Path:

@@ -21,6 +21,8 @@ from chromeball.scene.record import atomic_output
 RAW_SUFFIXES = frozenset(
     {".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw"}
 )
+#: attribute of a map that may hold negative values and is right
+NEGATIVE_MEANING = "negativeMeaning"
 LINEAR_SUFFIXES = frozenset({".exr", ".hdr", ".pfm"}) | RAW_SUFFIXES
 
 
@@ -65,13 +67,14 @@ class Image:
         return self.pixels.shape[1], self.pixels.shape[0]
 
     def radiance(self) -> NDArray[np.float32]:
-        """The pixels as float32; of a RAW picture the negative ones are 0.
+        """The pixels as float32; of a RAW picture, and a map merged from such, negative is 0.
 
-        There they are noise and colours that Rec.709 cannot show, in other pictures a mistake
+        There it is noise and colours that Rec.709 cannot show, in other pictures a mistake
         that is left for the caller to see.
         """
         pixels = self.pixels.astype(np.float32, copy=False)
-        return pixels if self.saturated is None else np.maximum(pixels, 0)
+        meant = self.saturated is not None or NEGATIVE_MEANING in self.attributes
+        return np.maximum(pixels, 0) if meant else pixels
 
 
 def read_image(path: str | os.PathLike[str]) -> Image:

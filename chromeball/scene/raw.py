@@ -147,6 +147,19 @@ def read_mosaic(path: str | os.PathLike[str]) -> Mosaic:
     )
 
 
+def no_bayer(path: str | os.PathLike[str]) -> str | None:
+    """Why a RAW picture is no Bayer mosaic of red, green and blue; None if it is one.
+
+    Raises
+    ------
+    UserError
+        When the file is missing or damaged.
+
+    """
+    with open_raw(Path(path)) as raw:
+        return _no_bayer(raw)
+
+
 def measured_white(
     pixels: NDArray[np.uint16], black: NDArray[np.float64], stated: NDArray[np.float64]
 ) -> NDArray[np.float64]:

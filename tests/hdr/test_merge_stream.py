@@ -152,7 +152,8 @@ def test_many_frames_need_the_memory_of_a_few(tmp_path: Path) -> None:
         )
         peaks.append(int(done.stdout.split()[-1]))
     assert peaks[1] - peaks[0] < 50
-    names = {"m.exr", "m.exr.record.json", "m.preview.png", "m.preview.png.record.json"}
+    names = {"m.exr", "m.preview.png", "m.histogram.png"}
+    names |= {f"{name}.record.json" for name in names}
     assert {path.name for path in (tmp_path / "out").iterdir()} == names
 
 
@@ -160,8 +161,19 @@ def test_a_preview_is_the_area_mean() -> None:
     rng = np.random.default_rng(0)
     picture = rng.random((37, 50, 3)).astype(np.float32)
     whole, parts = Preview(37, 50, 13), Preview(37, 50, 13)
-    whole.add(0, picture)
+    clipped = np.zeros((37, 50), np.int8)
+    clipped[3, 4], clipped[20, 30], clipped[20, 31] = 1, -1, 1
+    whole.add(0, picture, clipped, 3)
     for top in range(0, 37, 7):
-        parts.add(top, picture[top : top + 7])
-    np.testing.assert_array_equal(whole.finish(), parts.finish())
-    assert whole.finish().shape == (10, 13, 3)
+        parts.add(top, picture[top : top + 7], clipped[top : top + 7], 3)
+    a, b = whole.finish(), parts.finish()
+    np.testing.assert_array_equal(a.picture, b.picture)
+    assert a.picture.shape == (10, 13, 3)
+    np.testing.assert_array_equal(a.clipped, b.clipped)
+    assert a.clipped[0, 1] == 1
+    assert a.clipped[5, 7] == 1  # saturated outweighs black
+    assert np.count_nonzero(a.clipped) == 2
+    np.testing.assert_array_equal(a.histogram, b.histogram)
+    lit = clipped[::3, ::3] == 0
+    expected = np.histogram(np.log2(picture[::3, ::3, 1][lit]), a.edges)[0]
+    np.testing.assert_array_equal(a.histogram[1], expected)
