@@ -5,4 +5,5 @@
 NB_MODULE(kernel, m) {
   bind_response(m);
   bind_merge(m);
+  bind_align(m);
 }
