@@ -23,7 +23,7 @@ least BIC.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import numpy as np
@@ -68,6 +68,10 @@ SMOOTH = 1.0
 #: tiles that agree, least share of the tiles that do, least correlation, and how much better
 #: than any other place the motion found must be
 MOST_SIGMA, MOST_SPLIT, LEAST_TILES, LEAST_SHARE, LEAST_NCC, LEAST_LEAD = 0.3, 1.0, 8, 0.3, 0.2, 1.15
+#: share of the best motion's significance that keeps another one in the race
+RIVAL = 0.7
+#: standard deviations by which a tile's correlation must differ from none
+SIGNIFICANT = 3.5
 #: chi^2 (two degrees of freedom) at which a tile's weight is a quarter
 OUTLIER = 9.0
 
@@ -118,6 +122,12 @@ class _Tiles:
     b: Float  # (n, 2)
     ncc: float
     pixels: float
+    same: Mask  # (n,) whether the two exposures correlate in the tile
+
+    def structured(self) -> _Tiles:
+        """The tiles that show the same structure in both exposures."""
+        keep = self.same
+        return replace(self, x=self.x[keep], H=self.H[keep], b=self.b[keep], same=keep[keep])
 
 
 @dataclass(frozen=True)
@@ -376,7 +386,7 @@ class _Matcher:
     def __init__(self, a: _Level, b: _Level, known: tuple[Float, float] | None, blur: float):
         self.a, self.b, self.known, self.blur = a, b, known, blur
         self.size = 31 if max(a.codes.shape) > 400 else 21
-        self.tile = 32 if max(a.codes.shape) > 400 else 16
+        self.tile = 32 if max(a.codes.shape) > 1000 else 16
         # above the shorter's highest usable code there is nothing to compare
         self.rematch(np.eye(3))
 
@@ -466,13 +476,13 @@ class _Matcher:
         r = a - flat
         w = mask * self.weight
         wx, wy, wr = w * gx, w * gy, w * r
-        sums = np.stack(
-            [self._per_tile(v) for v in (wx * gx, wx * gy, wy * gy, wx * r, wy * r, wr * r, mask)]
-        )
+        wa, wb = w * a, w * flat
+        parts = (wx * gx, wx * gy, wy * gy, wx * r, wy * r, wr * r, mask, wa * a, wb * flat, wa * flat)
+        sums = np.stack([self._per_tile(v) for v in parts])
         rows, columns = sums.shape[1:]
         y, x = np.mgrid[0:rows, 0:columns] * float(self.tile) + (self.tile - 1) / 2
         enough = sums[6] >= 0.25 * self.tile**2
-        xx, xy, yy, xr, yr, rr, n = (v[enough].astype(np.float64) for v in sums)
+        xx, xy, yy, xr, yr, rr, n, aa, bb, ab = (v[enough].astype(np.float64) for v in sums)
         H = np.stack([np.stack([xx, xy], -1), np.stack([xy, yy], -1)], -2)
         H += (1e-3 * (xx + yy) / 2 + 1e-12)[:, None, None] * np.eye(2)
         b_ = np.stack([xr, yr], -1)
@@ -481,14 +491,16 @@ class _Matcher:
         # smoothed pixels are correlated over 4 pi sigma^2 of them (at least a few: JPEG)
         area = max(4.0, 4 * np.pi * self.blur**2)
         variance = area * left / np.maximum(n - 2, 1) + 1e-6
-        product = float((w * a * flat).sum())
-        norm = float(np.sqrt((w * a * a).sum() * (w * flat * flat).sum()))
+        norm = float(np.sqrt(aa.sum() * bb.sum()))
+        # a tile of noise alone would say "as it is" (its gradients are in H, not in b)
+        same = ab > SIGNIFICANT * np.sqrt(aa * bb * area / np.maximum(n, 1))
         return _Tiles(
             np.stack([x[enough], y[enough]], -1),
             H / variance[:, None, None],
             b_ / variance[:, None],
-            product / norm if norm > 0 else 0.0,
+            float(ab.sum()) / norm if norm > 0 else 0.0,
             float(n.sum()) / area,
+            same,
         )
 
     def _per_tile(self, image: Image) -> Image:
@@ -497,12 +509,19 @@ class _Matcher:
         cut = image[: rows * t, : columns * t]
         return cast("Image", cut.reshape(rows, t, columns, t).sum(axis=(1, 3)))
 
-    def refine(self, M: Float, model: str, steps: int) -> tuple[Float, _Tiles]:
+    def refine(
+        self, M: Float, model: str, steps: int, *, structured: bool = False
+    ) -> tuple[Float, _Tiles]:
         """Gauss-Newton steps of the model on M, until it moves by less than 0.005 pixels."""
         height, width = self.a.codes.shape
         centre = np.array([(width - 1) / 2, (height - 1) / 2])
         scale = float(np.hypot(height, width) / 2)
-        tiles = self.tiles(M)
+
+        def measure(M: Float) -> _Tiles:
+            tiles = self.tiles(M)
+            return tiles.structured() if structured else tiles
+
+        tiles = measure(M)
         for _ in range(steps):
             if len(tiles.x) < MODELS[model]:
                 break
@@ -512,7 +531,7 @@ class _Matcher:
             if not np.isfinite(size) or size > 0.25 * min(height, width):
                 break
             M = M @ _exponential(p, centre, scale)
-            tiles = self.tiles(M)
+            tiles = measure(M)
             if size < 0.005:
                 break
         return M, tiles
@@ -530,36 +549,22 @@ def _pair(
 ) -> _Pair:
     S = _coarse_to_frame(factor)
     top = len(a) - 1
-    turning = "rotation" if len(models) > 1 or "shift" not in models else "shift"
+    turning = "shift" if list(models) == ["shift"] else "rotation"
     matcher = _Matcher(a[top], b[top], known, 0.7)
-    starts = [np.eye(3), *matcher.starts()]
+    motions = [np.eye(3), *matcher.starts()]
     if guess is not None:
-        starts.append(_resize(np.linalg.inv(S) @ guess @ S, 2.0**-top))
-    results: list[tuple[float, Float]] = []
-    for M in starts:
-        matcher.rematch(M)
-        M, _ = matcher.refine(M, "shift", 4)
-        matcher.rematch(M)
-        M, tiles = matcher.refine(M, turning, 4)
-        results.append((_significance(tiles), M))
-    results.sort(key=lambda item: -item[0])
-    best, M = results[0]
-    height, width = a[top].codes.shape
-    corners = np.array([[0, 0], [width, 0], [0, height], [width, height]], np.float64)
+        motions.append(_resize(np.linalg.inv(S) @ guess @ S, 2.0**-top))
     lead = np.inf
-    for score, other in results[1:]:
-        if np.abs(_apply(other, corners) - _apply(M, corners)).max() > 3:
-            lead = min(lead, best / max(score, 1e-9))
-    model = turning
-    for level in range(top - 1, -1, -1):
-        M = _resize(M, 2.0)
-        matcher = _Matcher(a[level], b[level], known, SMOOTH if level == 0 else 0.7)
-        matcher.rematch(M)
-        M, tiles = matcher.refine(M, model, 6 if level == 0 else 3)
-    if top == 0:
-        M, tiles = matcher.refine(M, model, 6)
+    for level in range(top, -1, -1):
+        if level < top:
+            motions = [_resize(M, 2.0) for M in motions]
+            matcher = _Matcher(a[level], b[level], known, SMOOTH if level == 0 else 0.7)
+        steps = ["shift", turning] if level == top else [turning]
+        motions, lead = _rank_motions(matcher, motions, steps)
+    M, tiles = matcher.refine(motions[0], turning, 5, structured=True)
     if "homography" in models and len(tiles.x) > 0:
-        M, tiles = matcher.refine(M, _choose(tiles, models, matcher.a.codes.shape), 6)
+        model = _choose(tiles, models, matcher.a.codes.shape)
+        M, tiles = matcher.refine(M, model, 6, structured=True)
     flag = ""
     if len(tiles.x) < LEAST_TILES:
         flag = f"only {len(tiles.x)} tiles show structure in both exposures"
@@ -567,10 +572,37 @@ def _pair(
         flag = f"the two exposures correlate by {tiles.ncc:.2f} only"
     elif lead < LEAST_LEAD:
         flag = "another motion fits as well (repeated structure, or too little of it)"
-    scaled = _Tiles(
-        _apply(S, tiles.x), tiles.H / factor**2, tiles.b / factor, tiles.ncc, tiles.pixels
+    scaled = replace(
+        tiles, x=_apply(S, tiles.x), H=tiles.H / factor**2, b=tiles.b / factor
     )
     return _Pair(i, j, S @ M @ np.linalg.inv(S), scaled, flag, tiles.ncc)
+
+
+def _rank_motions(
+    matcher: _Matcher, motions: Sequence[Float], models: Sequence[str]
+) -> tuple[list[Float], float]:
+    """Refine motions; those that may still win, the best first, and its lead over the next."""
+    height, width = matcher.a.codes.shape
+    corners = np.array([[0, 0], [width, 0], [0, height], [width, height]], np.float64)
+
+    def apart(A: Float, B: Float) -> float:
+        return float(np.abs(_apply(A, corners) - _apply(B, corners)).max())
+
+    starts: list[Float] = []
+    for M in motions:
+        if all(apart(M, other) > 2 for other in starts):
+            starts.append(M)
+    scored: list[tuple[float, Float]] = []
+    for M in starts:
+        for model in models:
+            matcher.rematch(M)
+            M, tiles = matcher.refine(M, model, 4)
+        scored.append((_significance(tiles), M))
+    scored.sort(key=lambda item: -item[0])
+    best, M = scored[0]
+    others = [item for item in scored[1:] if apart(item[1], M) > 2]
+    lead = best / max(others[0][0], 1e-9) if others else np.inf
+    return [M, *(other for score, other in others[:2] if score > RIVAL * best)], lead
 
 
 def _significance(tiles: _Tiles) -> float:
@@ -597,7 +629,7 @@ def _fit(J: Float, H: Float, b: Float) -> _Fit:
 
     Geman-McClure weights: (1 + chi2 / OUTLIER)^-2.
     """
-    cov = np.linalg.inv(H)
+    cov = _inverse(H)
     u = np.einsum("nij,nj->ni", cov, b)
     robust = np.ones(len(J))
     tau2 = 0.0
@@ -605,14 +637,11 @@ def _fit(J: Float, H: Float, b: Float) -> _Fit:
     p = np.zeros(J.shape[2])
     chi2 = np.zeros(len(J))
     for step in range(12):
-        W = np.linalg.inv(cov + tau2 * np.eye(2))
-        JW = np.einsum("nij,nik->njk", J, W * robust[:, None, None])
-        A = np.einsum("nij,njk->ik", JW, J)
-        A += 1e-12 * np.trace(A) * np.eye(len(A))
-        p = np.linalg.solve(A, np.einsum("nij,nj->i", JW, u))
+        W = _inverse(cov + tau2 * np.eye(2))
+        p = _weighted(J, W, robust, u)
         e = u - J @ p
         tau2 = _scatter(e, cov)
-        W = np.linalg.inv(cov + tau2 * np.eye(2))
+        W = _inverse(cov + tau2 * np.eye(2))
         chi2 = np.einsum("ni,nij,nj->n", e, W, e)
         # graduated: a generous weight first, so that a poor start does not lose the majority
         robust = (1 + chi2 / (OUTLIER * max(1, 8 >> step))) ** -2
@@ -623,19 +652,33 @@ def _scatter(e: Float, cov: Float) -> float:
     """tau^2 at which the median of chi^2 is that of two degrees of freedom (1.386)."""
     if len(e) < 3:
         return 0.0
-    values, vectors = np.linalg.eigh(cov)
-    along = np.einsum("nji,nj->ni", vectors, e) ** 2
-
-    def excess(tau2: float) -> float:
-        return float(np.median((along / (values + tau2)).sum(axis=1))) - 1.386
-
-    if excess(0.0) <= 0:
+    # in the axes of each tile: chi2 = sum of along / (value + tau^2)
+    half, skew, cross = (
+        0.5 * (cov[:, 0, 0] + cov[:, 1, 1]),
+        0.5 * (cov[:, 0, 0] - cov[:, 1, 1]),
+        cov[:, 0, 1],
+    )
+    radius = np.hypot(skew, cross)
+    turn = 0.5 * np.arctan2(cross, skew)
+    first = (np.cos(turn) * e[:, 0] + np.sin(turn) * e[:, 1]) ** 2
+    second = (np.cos(turn) * e[:, 1] - np.sin(turn) * e[:, 0]) ** 2
+    squares = first + second
+    tau2 = np.append(0.0, np.geomspace(1e-5, np.median(squares) + 1e-4, 20))[:, None]
+    small = np.maximum(half - radius, 0)
+    chi2 = first / (half + radius + tau2) + second / np.maximum(small + tau2, 1e-12)
+    middle = np.median(chi2, axis=1)
+    if middle[0] <= 1.386:
         return 0.0
-    low, high = 1e-8, float(np.median((e**2).sum(axis=1))) + 1e-6
-    for _ in range(30):
-        middle = np.sqrt(low * high)
-        low, high = (middle, high) if excess(middle) > 0 else (low, middle)
-    return float(high)
+    return float(np.interp(-1.386, -middle, tau2[:, 0]))
+
+
+def _inverse(A: Float) -> Float:
+    """Of symmetric 2 x 2 matrices, (n, 2, 2)."""
+    out = np.empty_like(A)
+    det = A[:, 0, 0] * A[:, 1, 1] - A[:, 0, 1] ** 2
+    out[:, 0, 0], out[:, 1, 1] = A[:, 1, 1] / det, A[:, 0, 0] / det
+    out[:, 0, 1] = out[:, 1, 0] = -A[:, 0, 1] / det
+    return out
 
 
 def _choose(tiles: _Tiles, models: Sequence[str], shape: tuple[int, ...]) -> str:
@@ -658,10 +701,12 @@ def _choose(tiles: _Tiles, models: Sequence[str], shape: tuple[int, ...]) -> str
 
 
 def _weighted(J: Float, W: Float, robust: Float, u: Float) -> Float:
-    JW = np.einsum("nij,nik->njk", J, W * robust[:, None, None])
-    A = np.einsum("nij,njk->ik", JW, J)
+    """The p of least sum of robust (u - J p)' W (u - J p)."""
+    WJ = (W * robust[:, None, None]) @ J
+    flat, right = WJ.reshape(-1, J.shape[2]), J.reshape(-1, J.shape[2])
+    A = flat.T @ right
     A += 1e-12 * np.trace(A) * np.eye(len(A))
-    return np.linalg.solve(A, np.einsum("nij,nj->i", JW, u))
+    return np.linalg.solve(A, flat.T @ u.reshape(-1))
 
 
 # all frames ----------------------------------------------------------------------------------
@@ -696,7 +741,7 @@ class _Joint:
 def _observations(pairs: Sequence[_Pair]) -> _Observations:
     columns: list[list[Any]] = [[], [], [], [], [], []]
     for number, pair in enumerate(pairs):
-        cov = np.linalg.inv(pair.tiles.H)
+        cov = _inverse(pair.tiles.H)
         u = np.einsum("nij,nj->ni", cov, pair.tiles.b)
         near = np.hypot(*u.T) < 4 * np.sqrt(np.prod(np.ptp(pair.tiles.x, axis=0) + 1)) / 4
         n = int(near.sum())
@@ -729,14 +774,14 @@ def _solve(
     place = np.full(len(T), -1)
     place[free] = np.arange(len(free))
     robust = np.ones(n) if fixed is None else fixed[1]
-    W = np.linalg.inv(seen.cov) if fixed is None else fixed[0]
+    W = _inverse(seen.cov) if fixed is None else fixed[0]
 
     def positions(at: NDArray[np.int64], x: Float) -> Float:
         flat = np.concatenate([x, np.ones((n, 1))], axis=1)
         moved = np.einsum("nij,nj->ni", T[at], flat)
         return moved[:, :2] / moved[:, 2:]
 
-    A, J, e = np.eye(size), np.zeros((n, 2, size)), np.zeros((n, 2))
+    A, WJ, e = np.eye(size), np.zeros((2 * n, size)), np.zeros((n, 2))
     for step in range(12 if fixed is None else 4):
         xi, yj = positions(seen.i, seen.x), positions(seen.j, seen.y)
         e = yj - xi
@@ -744,7 +789,7 @@ def _solve(
             for number in np.unique(seen.edge):
                 mine = seen.edge == number
                 tau2 = _scatter(e[mine], seen.cov[mine])
-                W[mine] = np.linalg.inv(seen.cov[mine] + tau2 * np.eye(2))
+                W[mine] = _inverse(seen.cov[mine] + tau2 * np.eye(2))
             chi2 = np.einsum("ni,nij,nj->n", e, W, e)
             robust = (1 + chi2 / (OUTLIER * max(1, 8 >> step))) ** -2
         J = np.zeros((n, 2, len(free), count))
@@ -754,14 +799,14 @@ def _solve(
                 points[moves], centre, scale, count
             )
         J = J.reshape(n, 2, size)
-        JW = np.einsum("nij,nik->njk", J, W * robust[:, None, None])
-        A = np.einsum("nij,njk->ik", JW, J)
+        WJ = ((W * robust[:, None, None]) @ J).reshape(2 * n, size)
+        A = WJ.T @ J.reshape(2 * n, size)
         A += 1e-10 * np.trace(A) / size * np.eye(size)
-        p = np.linalg.solve(A, np.einsum("nij,nj->i", JW, e)).reshape(-1, count)
+        p = np.linalg.solve(A, WJ.T @ e.reshape(2 * n)).reshape(-1, count)
         for number, part in zip(free, p, strict=True):
             T[number] = _exponential(part, centre, scale) @ T[number]
             T[number] /= T[number, 2, 2]
-    score = np.einsum("nij,ni->nj", J, np.einsum("nij,nj->ni", W * robust[:, None, None], e))
+    score = np.einsum("nij,ni->nj", WJ.reshape(n, 2, size), e)
     inverse = np.linalg.inv(A)
     whole = inverse @ (score.T @ score) @ inverse
     cov = np.zeros((len(T), count, count))
@@ -831,6 +876,10 @@ def _joint(
             weight = joint.robust[mine] * np.trace(joint.W[mine], axis1=1, axis2=2)
             squares = (joint.e[mine] ** 2).sum(axis=1)
             residual[number] = np.sqrt((weight @ squares) / weight.sum())
+    for k in np.flatnonzero(~sound):
+        # nothing known: as the nearest exposure that is known
+        known = min(np.flatnonzero(sound), key=lambda m: abs(_rank(order, k) - _rank(order, m)))
+        T[k] = T[known]
     sigma[reference] = split[reference] = residual[reference] = 0.0
     corners = np.array([[0, 0], [width, 0], [0, height], [width, height]], np.float64)
     moved = np.array([np.hypot(*(_apply(t, corners) - corners).T).max() for t in T])
