@@ -56,7 +56,7 @@ MODELS = {"shift": 2, "rotation": 3, "homography": 8}
 #: codes (of 255) between which a pixel is compared: below is black, above clipped
 DARK, BRIGHT = 4.0, 250.0
 #: pixels of the finest level that is compared; larger frames are averaged down to it
-FINEST = 2_000_000
+FINEST = 1_000_000
 #: long side of the level that the search starts on, and the rotations tried there, radians
 COARSEST = 256
 TURNS = np.deg2rad([0.0, -1.5, 1.5, -3.0, 3.0])
@@ -183,7 +183,9 @@ def align(
 
     pairs = [pair(int(i), int(j), None) for i, j in zip(order, order[1:])]
     for k in range(P - 2):
-        pairs.append(pair(int(order[k]), int(order[k + 2]), pairs[k + 1].M @ pairs[k].M))
+        sound = not (pairs[k].flag or pairs[k + 1].flag)
+        guess = pairs[k + 1].M @ pairs[k].M if sound else None
+        pairs.append(pair(int(order[k]), int(order[k + 2]), guess))
     return _joint(pairs, P, chosen, order, (height, width), exposed, models)
 
 
@@ -548,12 +550,14 @@ def _pair(
     models: Sequence[str],
 ) -> _Pair:
     S = _coarse_to_frame(factor)
-    top = len(a) - 1
+    # a chain of sound pairs needs no search
+    top = len(a) - 1 if guess is None else min(len(a) - 1, 1)
     turning = "shift" if list(models) == ["shift"] else "rotation"
     matcher = _Matcher(a[top], b[top], known, 0.7)
-    motions = [np.eye(3), *matcher.starts()]
-    if guess is not None:
-        motions.append(_resize(np.linalg.inv(S) @ guess @ S, 2.0**-top))
+    if guess is None:
+        motions = [np.eye(3), *matcher.starts()]
+    else:
+        motions = [_resize(np.linalg.inv(S) @ guess @ S, 2.0**-top)]
     lead = np.inf
     for level in range(top, -1, -1):
         if level < top:
@@ -808,7 +812,11 @@ def _solve(
             T[number] /= T[number, 2, 2]
     score = np.einsum("nij,ni->nj", WJ.reshape(n, 2, size), e)
     inverse = np.linalg.inv(A)
-    whole = inverse @ (score.T @ score) @ inverse
+    # errors of neighbouring tiles, and of a place in several pairs, are one error
+    _, cell = np.unique(_cells(seen.x, scale), axis=0, return_inverse=True)
+    cluster = np.zeros((int(cell.max()) + 1, size))
+    np.add.at(cluster, cell.reshape(-1), score)
+    whole = inverse @ (cluster.T @ cluster) @ inverse
     cov = np.zeros((len(T), count, count))
     for k, number in enumerate(free):
         cov[number] = whole[k * count : (k + 1) * count, k * count : (k + 1) * count]
@@ -948,8 +956,11 @@ def _rigid(T: Float, centre: Float) -> Float:
 
 def _half(x: Float, scale: float) -> NDArray[np.int64]:
     """0 or 1 by a chessboard over the picture."""
-    cell = np.floor(x / (scale / 8)).astype(np.int64)
-    return (cell[:, 0] + cell[:, 1]) % 2
+    return _cells(x, scale).sum(axis=1) % 2
+
+
+def _cells(x: Float, scale: float) -> NDArray[np.int64]:
+    return np.floor(x / (scale / 8)).astype(np.int64)
 
 
 def _rank(order: NDArray[np.int64], frame: int) -> int:
