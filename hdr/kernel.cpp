@@ -6,4 +6,5 @@ NB_MODULE(kernel, m) {
   bind_response(m);
   bind_merge(m);
   bind_align(m);
+  bind_ghost(m);
 }

@@ -53,3 +53,4 @@ inline void check_table(std::size_t size) {
 void bind_response(nb::module_& m);
 void bind_merge(nb::module_& m);
 void bind_align(nb::module_& m);
+void bind_ghost(nb::module_& m);

@@ -91,3 +91,10 @@ def warp_u16(
 def warp_f32(
     frame: NDArray[np.float32], inverse: NDArray[np.float64], white: float
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]: ...
+def ghost_scores(
+    frames: Sequence[NDArray[np.uint8]],
+    table: NDArray[np.float64],
+    ranges: NDArray[np.int32],
+    valid: Sequence[NDArray[np.bool_]],
+    misaligned: float,
+) -> NDArray[np.uint8]: ...
