@@ -55,11 +55,17 @@ void score_rows(const Stack3& s, std::size_t from, std::size_t to, std::uint8_t*
   const std::size_t P = s.frames.size(), n = s.width * C;
   std::vector<std::uint8_t> low(n), high(n), spread(P * n);
   std::vector<float> value(P), weight(P);
+  std::vector<std::uint8_t> bent(P);
   for (std::size_t y = from; y < to; ++y) {
     for (std::size_t j = 0; j < P; ++j)
       spread_row(s.frames[j], y, s.height, s.width, C, low.data(), high.data(), &spread[j * n]);
     for (std::size_t x = 0; x < s.width; ++x) {
       const std::size_t at = y * s.width + x;
+      // Once a channel clips, the camera bends the colour: the others measure nothing either.
+      for (std::size_t j = 0; j < P; ++j) {
+        bent[j] = 0;
+        for (std::size_t c = 0; c < C; ++c) bent[j] |= s.frames[j][at * C + c] > s.ranges[j * C + c].high;
+      }
       float total = 0;
       for (std::size_t c = 0; c < C; ++c) {
         float sum = 0, weights = 0, worst = 0, measured = 0;
@@ -74,6 +80,8 @@ void score_rows(const Stack3& s, std::size_t from, std::size_t to, std::uint8_t*
           const float variance = entry.variance + s.edge * d * d * entry.slope2;
           if (z > range.high) {
             if (entry.value > least) least = entry.value, least_variance = variance;
+          } else if (bent[j]) {
+            continue;
           } else if (z < range.low) {
             if (entry.value < most) most = entry.value, most_variance = variance;
           } else {

@@ -355,6 +355,14 @@ def _regions(
         wide,
     )[size:-size, size:-size]
     mask = np.ascontiguousarray(mask)
+    outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    holes = np.zeros_like(mask)
+    cv2.drawContours(holes, outlines, -1, 1, cv2.FILLED)
+    # holes are filled, not what a region goes around
+    count, inner, stats, _ = cv2.connectedComponentsWithStats(holes - mask, connectivity=4)
+    small = np.asarray(stats)[:, cv2.CC_STAT_AREA] <= 4 * least
+    small[0] = False
+    mask |= small[inner].astype(np.uint8)
     _, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
     boxes = [
         (int(x), int(y), int(w), int(h), int(n)) for x, y, w, h, n in np.asarray(stats)[1:]
