@@ -359,15 +359,20 @@ def _regions(
     holes = np.zeros_like(mask)
     cv2.drawContours(holes, outlines, -1, 1, cv2.FILLED)
     # holes are filled, not what a region goes around
-    count, inner, stats, _ = cv2.connectedComponentsWithStats(holes - mask, connectivity=4)
+    _, inner, stats, _ = cv2.connectedComponentsWithStats(holes - mask, connectivity=4)
     small = np.asarray(stats)[:, cv2.CC_STAT_AREA] <= 4 * least
     small[0] = False
     mask |= small[inner].astype(np.uint8)
     _, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
+    # what the closing split off again
+    large = np.asarray(stats)[:, cv2.CC_STAT_AREA] >= least
+    large[0] = False
+    labels = np.where(large, np.cumsum(large), 0).astype(np.int32)[labels]
+    stats = np.concatenate([np.asarray(stats)[:1], np.asarray(stats)[large]])
     boxes = [
         (int(x), int(y), int(w), int(h), int(n)) for x, y, w, h, n in np.asarray(stats)[1:]
     ]
-    return np.asarray(labels, np.int32), boxes
+    return labels, boxes
 
 
 def _refuse(
