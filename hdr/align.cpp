@@ -27,7 +27,7 @@ struct Size {
 };
 
 template <typename T, std::size_t C>
-void warp_rows(const T* in, Size size, const double* M, T white, T* out, bool* valid,
+void warp_rows(const T* in, Size size, const double* M, T white, bool held, T* out, bool* valid,
                std::ptrdiff_t from, std::ptrdiff_t to) {
   const auto [height, width] = size;
   for (std::ptrdiff_t y = from; y < to; ++y)
@@ -68,7 +68,7 @@ void warp_rows(const T* in, Size size, const double* M, T white, T* out, bool* v
             high = std::max(high, value);
           }
         T& result = out[at * C + c];
-        if (high >= white || low <= T(0)) {
+        if (held && (high >= white || low <= T(0))) {
           result = high >= white ? high : T(0);
           continue;
         }
@@ -78,18 +78,18 @@ void warp_rows(const T* in, Size size, const double* M, T white, T* out, bool* v
           for (int i = 0; i < 4; ++i) row += wx[i] * static_cast<float>(in[(cy[j] + cx[i]) * C + c]);
           sum += wy[j] * row;
         }
-        sum = std::clamp(sum, static_cast<float>(low), static_cast<float>(high));
-        if constexpr (std::is_integral_v<T>)
-          result = static_cast<T>(sum + 0.5f);
+        if (held) sum = std::clamp(sum, static_cast<float>(low), static_cast<float>(high));
+        if constexpr (std::is_integral_v<T>)  // unheld sums may leave the type's range
+          result = static_cast<T>(std::clamp(sum, 0.0f, static_cast<float>(white)) + 0.5f);
         else
           result = sum;
       }
     }
 }
 
-// M: output pixel -> input pixel.
+// M: output pixel -> input pixel. Held: within the four nearest pixels, clipped if one of them is.
 template <typename T>
-nb::tuple warp(Picture<T> frame, Table2 M, double white) {
+nb::tuple warp(Picture<T> frame, Table2 M, double white, bool held) {
   const Size size{static_cast<std::ptrdiff_t>(frame.shape(0)),
                   static_cast<std::ptrdiff_t>(frame.shape(1))};
   const std::size_t C = frame.shape(2), pixels = frame.shape(0) * frame.shape(1);
@@ -101,7 +101,7 @@ nb::tuple warp(Picture<T> frame, Table2 M, double white) {
     nb::gil_scoped_release release;
     const auto run = C == 1 ? warp_rows<T, 1> : warp_rows<T, 3>;
     tbb::parallel_for(tbb::blocked_range<std::ptrdiff_t>(0, size.height, 16), [&](const auto& r) {
-      run(frame.data(), size, M.data(), static_cast<T>(white), out.get(), valid.get(), r.begin(),
+      run(frame.data(), size, M.data(), static_cast<T>(white), held, out.get(), valid.get(), r.begin(),
           r.end());
     });
   }
@@ -112,7 +112,10 @@ nb::tuple warp(Picture<T> frame, Table2 M, double white) {
 }  // namespace
 
 void bind_align(nb::module_& m) {
-  m.def("warp_u8", &warp<std::uint8_t>, nb::arg("frame"), nb::arg("inverse"), nb::arg("white"));
-  m.def("warp_u16", &warp<std::uint16_t>, nb::arg("frame"), nb::arg("inverse"), nb::arg("white"));
-  m.def("warp_f32", &warp<float>, nb::arg("frame"), nb::arg("inverse"), nb::arg("white"));
+  m.def("warp_u8", &warp<std::uint8_t>, nb::arg("frame"), nb::arg("inverse"), nb::arg("white"),
+        nb::arg("held") = true);
+  m.def("warp_u16", &warp<std::uint16_t>, nb::arg("frame"), nb::arg("inverse"), nb::arg("white"),
+        nb::arg("held") = true);
+  m.def("warp_f32", &warp<float>, nb::arg("frame"), nb::arg("inverse"), nb::arg("white"),
+        nb::arg("held") = true);
 }

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -45,9 +46,10 @@ LEAST_FACTOR, MOST_FACTOR = 0.1, 100.0
 
 @dataclass(frozen=True)
 class Region:
-    """A connected ghost: its box (x, y, width, height), pixels, the frame it is taken from,
+    """A connected ghost.
 
-    and how many of its pixels are clipped or black even there.
+    Its box (x, y, width, height), its pixels, the frame it is taken from, and how many of its
+    pixels are clipped or black even there.
     """
 
     box: tuple[int, int, int, int]
@@ -97,11 +99,12 @@ def find_ghosts(
 ) -> Ghosts:
     """Find what moved in aligned frames (H, W, C).
 
-    `log_exposure` (C, 256) is the response of 8-bit frames and `sigma` (C, 256) its standard
-    error, `code_noise` (C,) the standard deviation of a pixel in codes (of 255, after a root
-    for linear frames). Without `log_exposure` the frames are linear, uint16 or float32, with
-    `white` their saturated value (65535, or the largest float). `valid` (H, W) a frame: where
-    it has pixels, as :func:`chromeball.hdr.align.warp` says. `misaligned` in pixels.
+    `log_exposure` (C, codes) is the response of frames of codes and `sigma` (C, codes) its
+    standard error, `code_noise` (C,) the standard deviation of a pixel in codes (for linear
+    frames of 255, after a root). Without `log_exposure` the frames are linear, uint16 or
+    float32, with `white` their saturated value (65535, or the largest float). `valid` (H, W),
+    one a frame: where it has pixels, as :func:`chromeball.hdr.align.warp` says. `misaligned`
+    in pixels.
 
     Raises
     ------
@@ -110,10 +113,11 @@ def find_ghosts(
 
     """
     _refuse(frames, exposures, log_exposure, code_noise, misaligned)
-    height, width, channels = frames[0].shape
+    channels = frames[0].shape[2]
     tones, g = _tones(frames, log_exposure, white)
-    error = np.zeros((channels, CODES)) if sigma is None else sigma
-    noise = np.maximum(np.broadcast_to(code_noise, (channels,)), 12**-0.5)
+    error = np.zeros((channels, CODES)) if sigma is None else _at_tones(sigma)
+    scale = 1.0 if log_exposure is None else (CODES - 1) / (log_exposure.shape[1] - 1)
+    noise = np.maximum(np.broadcast_to(code_noise, (channels,)) * scale, 12**-0.5)
     darkest = np.clip(np.ceil(3 * noise), DARKEST, 64).astype(np.int32)
     brightest = np.clip(CODES - 2 - np.ceil(3 * noise), 128, BRIGHTEST).astype(np.int32)
     slope, variance = _propagate(g, noise)
@@ -206,7 +210,7 @@ def _single(
     else:
         channel = np.arange(pixels.shape[2])
         radiance = np.exp(log_exposure[channel, pixels] - np.log(exposure)).astype(np.float32)
-        high, low = pixels == CODES - 1, pixels == 0
+        high, low = pixels == log_exposure.shape[1] - 1, pixels == 0
     mark = np.where(high.any(axis=2), 1, np.where(low.any(axis=2), -1, 0))
     return radiance, mark.astype(np.int8)
 
@@ -218,16 +222,26 @@ def _white(frames: Sequence[NDArray[Any]]) -> float:
 def _tones(
     frames: Sequence[NDArray[Any]], log_exposure: Float | None, white: float | None
 ) -> tuple[list[NDArray[np.uint8]], Float]:
-    """8-bit frames and their ln exposure; linear ones through a root, which evens shot noise."""
+    """8-bit frames and their ln exposure; linear ones through a root: it evens shot noise."""
     if log_exposure is not None:
-        return [np.ascontiguousarray(f) for f in frames], log_exposure
+        scale = (CODES - 1) / (log_exposure.shape[1] - 1)
+        same = frames[0].dtype == np.uint8
+        tones = [f if same else (f * scale + 0.5).astype(np.uint8) for f in frames]
+        return [np.ascontiguousarray(tone) for tone in tones], _at_tones(log_exposure)
     limit = _white(frames) if white is None else white
-    tones: list[NDArray[np.uint8]] = []
+    tones = []
     for frame in frames:
         share = np.sqrt(np.minimum(frame, limit).astype(np.float32) / np.float32(limit))
         tones.append((255 * share + 0.5).astype(np.uint8))
     z = np.maximum(np.arange(CODES), 0.25)
     return tones, np.repeat(2 * np.log(z / 128)[None], frames[0].shape[2], axis=0)
+
+
+def _at_tones(table: Float) -> Float:
+    """A table over codes (C, codes) at 256 of them."""
+    codes = table.shape[1]
+    at = np.linspace(0, codes - 1, CODES)
+    return np.stack([np.interp(at, np.arange(codes), row) for row in table])
 
 
 def _propagate(g: Float, noise: Float) -> tuple[Float, Float]:
@@ -248,7 +262,9 @@ def _propagate(g: Float, noise: Float) -> tuple[Float, Float]:
 
 
 def _shows(
-    tone: NDArray[np.uint8], limit: tuple[NDArray[np.int32], NDArray[np.int32]], valid: Mask | None
+    tone: NDArray[np.uint8],
+    limit: tuple[NDArray[np.int32], NDArray[np.int32]],
+    valid: Mask | None,
 ) -> Mask:
     low, high = (edge.astype(np.uint8) for edge in limit)
     shown = ((tone >= low) & (tone <= high)).all(axis=2)
@@ -256,7 +272,7 @@ def _shows(
 
 
 def _worth(tone: NDArray[np.uint8], worth: Float, shown: Mask) -> float:
-    """Mean over a lattice of pixels of what they are worth (C, 256), where they show anything."""
+    """Mean over a lattice of what pixels are worth (C, 256), where they show anything."""
     step = max(1, int(np.sqrt(shown.size / 100_000)))
     lattice = tone[::step, ::step]
     values = worth[np.arange(tone.shape[2]), lattice].mean(axis=2)
@@ -273,10 +289,10 @@ def _inflation(
     misaligned: float,
     exposures: Float,
 ) -> Float:
-    """Measured over modelled variance per frame, channel and code, at least 1; (P, C, 256).
+    """Measured over modelled variance per frame, channel and code; (P, C, 256).
 
-    From exposures one and two apart on a lattice of pixels: the median square of the standardised
-    difference over that of a normal one (0.455), in bins of 16 codes.
+    From exposures one and two apart on a lattice of pixels: the median square of the
+    standardised difference over that of a normal one (0.455), in bins of 16 codes.
     """
     P, channels = len(tones), variance.shape[0]
     largest = np.zeros((P, channels, CODES))
@@ -287,7 +303,7 @@ def _inflation(
     spread = [_spread(tone, step) for tone in tones]
     known = [mask[::step, ::step] for mask in masks]
     z = np.arange(CODES)
-    near = [*zip(order, order[1:]), *zip(order, order[2:])]
+    near = [*pairwise(order), *zip(order, order[2:], strict=False)]
     for a, b in [*near, *((b, a) for a, b in near)]:
         for c in range(channels):
             low, high = int(limit[0][c]), int(limit[1][c])
@@ -336,43 +352,43 @@ def _regions(
 
     height, width = score.shape
     least = max(LEAST_AREA, round(LEAST_SHARE * height * width))
-    smooth = cv2.blur(score, (3, 3))
+    smooth = _bytes(cv2.blur(score, (3, 3)))
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3))
-    grow = cv2.morphologyEx((smooth > 8 * GROW).astype(np.uint8), cv2.MORPH_OPEN, disc)
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(grow, connectivity=8)
-    seeds = np.bincount(labels[smooth > 8 * SEED], minlength=count)
-    area = np.asarray(stats)[:, cv2.CC_STAT_AREA]
+    grow = cv2.morphologyEx(_bytes(smooth > 8 * GROW), cv2.MORPH_OPEN, disc)
+    labels, area = _components(_bytes(grow))
+    seeds = np.bincount(labels[smooth > 8 * SEED], minlength=len(area))
     keep = (area >= least) & (seeds >= max(4, least // 4))
-    keep[0] = False
     # joined over small gaps, with a rim for soft borders
     radius = max(2, round(float(np.hypot(height, width)) / 500))
     size = 2 * radius + 1
     wide = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
-    mask = cv2.dilate(keep[labels].astype(np.uint8), wide)
-    mask = cv2.morphologyEx(
-        cv2.copyMakeBorder(mask, size, size, size, size, cv2.BORDER_CONSTANT, value=0),
-        cv2.MORPH_CLOSE,
-        wide,
-    )[size:-size, size:-size]
-    mask = np.ascontiguousarray(mask)
-    outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    holes = np.zeros_like(mask)
-    cv2.drawContours(holes, outlines, -1, 1, cv2.FILLED)
-    # holes are filled, not what a region goes around
-    _, inner, stats, _ = cv2.connectedComponentsWithStats(holes - mask, connectivity=4)
-    small = np.asarray(stats)[:, cv2.CC_STAT_AREA] <= 4 * least
-    small[0] = False
-    mask |= small[inner].astype(np.uint8)
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
-    # what the closing split off again
-    large = np.asarray(stats)[:, cv2.CC_STAT_AREA] >= least
+    mask = np.pad(_bytes(cv2.dilate(_bytes(keep[labels]), wide)), size)
+    mask = _bytes(cv2.morphologyEx(mask, cv2.MORPH_CLOSE, wide))[size:-size, size:-size]
+    # small holes are filled; what a region goes around is not
+    inner, area = _components(_bytes(mask == 0))
+    mask = _bytes((mask > 0) | ((area <= 4 * least) & (np.arange(len(area)) > 0))[inner])
+    _, found, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
+    table = np.asarray(stats, np.int64)
+    large = table[:, cv2.CC_STAT_AREA] >= least  # closing may split off crumbs
     large[0] = False
-    labels = np.where(large, np.cumsum(large), 0).astype(np.int32)[labels]
-    stats = np.concatenate([np.asarray(stats)[:1], np.asarray(stats)[large]])
-    boxes = [
-        (int(x), int(y), int(w), int(h), int(n)) for x, y, w, h, n in np.asarray(stats)[1:]
+    labels = np.where(large, np.cumsum(large), 0).astype(np.int32)[np.asarray(found, np.int32)]
+    return labels, [
+        (int(x), int(y), int(w), int(h), int(area)) for x, y, w, h, area in table[large]
     ]
-    return labels, boxes
+
+
+def _bytes(values: Any) -> NDArray[np.uint8]:
+    return np.ascontiguousarray(values, dtype=np.uint8)
+
+
+def _components(mask: NDArray[np.uint8]) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+    """Labels (H, W) of connected pixels, and pixels of each; that of no label is 0."""
+    import cv2
+
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
+    area = np.asarray(stats, np.int64)[:, cv2.CC_STAT_AREA].copy()
+    area[0] = 0
+    return np.asarray(labels, np.int32), area
 
 
 def _refuse(
@@ -391,10 +407,19 @@ def _refuse(
     first = frames[0]
     if first.ndim != 3 or any(f.shape != first.shape or f.dtype != first.dtype for f in frames):
         raise UserError("the pictures of a bracket have one size, (H, W, C), and one type")
-    if (log_exposure is None) != (first.dtype in (np.uint16, np.float32)):
-        raise UserError("8-bit pictures need a response, linear ones have none")
-    if log_exposure is not None and log_exposure.shape != (first.shape[2], CODES):
-        raise UserError("the response does not have the pictures' channels")
+    if str(first.dtype) not in ("uint8", "uint16", "float32"):
+        raise UserError(f"pictures of {first.dtype} values: 8-bit, 16-bit or float are needed")
+    if log_exposure is None:
+        if first.dtype == np.uint8:
+            raise UserError("8-bit pictures need a response: make it with `hdr response`")
+    else:
+        codes = log_exposure.shape[1]
+        if first.dtype == np.float32 or (first.dtype == np.uint8 and codes != CODES):
+            raise UserError(f"a response of {codes} codes is not for pictures of {first.dtype}")
+        if log_exposure.shape[0] != first.shape[2]:
+            raise UserError("the response does not have the pictures' channels")
+        if max(int(f.max()) for f in frames) >= codes:
+            raise UserError(f"the pictures hold codes beyond the {codes} of the response")
     if not (np.all(np.isfinite(code_noise)) and np.all(code_noise >= 0)):
         raise UserError("the noise of a code is a positive number")
     if not (np.isfinite(misaligned) and misaligned >= 0):

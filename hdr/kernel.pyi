@@ -75,21 +75,14 @@ def merge_linear_f32(
     sigma: NDArray[np.float32] | None,
     clipped: NDArray[np.int8],
 ) -> NDArray[np.int64]: ...
-    white: float,
-    gain: float,
-    read: float,
-    with_sigma: bool,
-) -> tuple[
-    NDArray[np.float32], NDArray[np.float32] | None, NDArray[np.int8], NDArray[np.int64]
-]: ...
 def warp_u8(
-    frame: NDArray[np.uint8], inverse: NDArray[np.float64], white: float
+    frame: NDArray[np.uint8], inverse: NDArray[np.float64], white: float, held: bool = True
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]: ...
 def warp_u16(
-    frame: NDArray[np.uint16], inverse: NDArray[np.float64], white: float
+    frame: NDArray[np.uint16], inverse: NDArray[np.float64], white: float, held: bool = True
 ) -> tuple[NDArray[np.uint16], NDArray[np.bool_]]: ...
 def warp_f32(
-    frame: NDArray[np.float32], inverse: NDArray[np.float64], white: float
+    frame: NDArray[np.float32], inverse: NDArray[np.float64], white: float, held: bool = True
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]: ...
 def ghost_scores(
     frames: Sequence[NDArray[np.uint8]],
