@@ -56,9 +56,8 @@ def hand_held(
             (width * fine, height * fine),
             flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
         )
-        views.append(
-            np.asarray(cv2.resize(moved, (width, height), interpolation=cv2.INTER_AREA))
-        )
+        view = cv2.resize(moved, (width, height), interpolation=cv2.INTER_AREA)
+        views.append(np.asarray(view, np.float64))
         poses.append(pose)
     return views, np.stack([np.linalg.inv(poses[0]) @ pose for pose in poses])
 
@@ -253,7 +252,7 @@ def test_real_brackets_moved_by_known_shifts(stack: str) -> None:
         pytest.skip("the shared brackets are not here")
     paths = sorted(p for p in (DATA / stack).iterdir() if p.suffix in (".png", ".jpg"))[1:4]
     frames = [read_image(path).pixels[30:330, 30:-30, :3] for path in paths]
-    times = np.array([0.5, 1 / 8, 1 / 30]) if stack != "memorial" else 2.0 ** -np.arange(3)
+    times = np.array([0.5, 1 / 8, 1 / 30]) if stack != "memorial" else np.exp2(-np.arange(3.0))
     still = align(frames, times)
     shifts = [(0, 0), (17, -9), (-21, 20)]
     height, width = (n - 48 for n in frames[0].shape[:2])

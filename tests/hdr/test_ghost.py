@@ -260,7 +260,7 @@ def test_static_real_brackets(stack: str) -> None:
     frames = [read_image(p).pixels[..., :3] for p in paths]
     if stack == "memorial":  # the painted borders differ
         frames = [np.ascontiguousarray(f[40:-60, 14:-14]) for f in frames[:10]]
-        times = 2.0 ** -np.arange(10)
+        times = np.exp2(-np.arange(10.0))
     else:
         times = np.array([2, 0.5, 1 / 8, 1 / 30, 1 / 125, 1 / 1000, 1 / 4000])
     solved = solve([sample(f) for f in frames], times)
