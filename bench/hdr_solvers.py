@@ -12,6 +12,9 @@ from typing import Any
 import cv2
 import numpy as np
 from colour_hdri import g_solve
+from colour_hdri.calibration.debevec1997 import extrapolating_function_polynomial
+from colour_hdri.generation import weighting_function_Debevec1997
+from colour_hdri.sampling import samples_Grossberg2003
 from numpy.typing import NDArray
 from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.spatial.distance import squareform
@@ -24,8 +27,10 @@ type Float = NDArray[np.float64]
 type Frames = list[NDArray[np.uint8]]
 type Solver = Callable[[Frames, Float, Prior | None], Float]
 
-#: pixels that the paper's dense solve is given: it has an unknown for each
-PAPER_PIXELS = 300
+#: samples that the paper's dense solve is given: it has an unknown for each
+PAPER_SAMPLES = 300
+#: steps by which a curve that does not rise is made to
+RISE = 1e-6
 
 
 def comparagram(frames: Frames, times: Float, prior: Prior | None) -> Float:
@@ -59,25 +64,36 @@ def opencv_robertson(frames: Frames, times: Float, prior: Prior | None) -> Float
 
 
 def paper(frames: Frames, times: Float, prior: Prior | None) -> Float:
-    """The program of the 1997 paper as colour-hdri has it, on a grid of pixels."""
-    height, width, channels = frames[0].shape
-    step = int(np.sqrt(height * width / PAPER_PIXELS))
-    grid = np.stack([frame[step // 2 :: step, step // 2 :: step] for frame in frames], axis=-1)
-    chosen = grid.reshape(-1, channels, len(frames))
-    return _zeroed(
-        np.stack([g_solve(chosen[:, c], np.log(times))[0] for c in range(channels)])
+    """The program of the 1997 paper as colour-hdri has it: its samples, its ends."""
+    stack = np.stack([frame / 255 for frame in frames], axis=-1)
+    chosen = samples_Grossberg2003(stack, samples=PAPER_SAMPLES)  # (samples, P, C)
+    solved = [g_solve(chosen[..., c], np.log(times))[0] for c in range(chosen.shape[2])]
+    # the paper's hat is zero at the ends, where its solve says nothing
+    ended = extrapolating_function_polynomial(
+        np.exp(np.stack(solved, axis=1)), weighting_function_Debevec1997
     )
+    return _logarithm(ended.T)
 
 
 def _opencv(tool: Any, frames: Frames, times: Float) -> Float:
-    curve = tool.process(frames, times.astype(np.float32)).reshape(256, 3).T
+    return _logarithm(tool.process(frames, times.astype(np.float32)).reshape(256, 3).T)
+
+
+def _logarithm(exposure: NDArray[Any]) -> Float:
     with np.errstate(divide="ignore", invalid="ignore"):
-        return _zeroed(np.log(curve.astype(np.float64)))
-
-
-def _zeroed(g: Float) -> Float:
+        g = np.log(exposure.astype(np.float64))
     finite = np.where(np.isfinite(g), g, np.nan)
     return finite - finite[:, 128, None]
+
+
+def rising(g: Float) -> Float:
+    """Missing codes from their neighbours; where it falls, level outwards from the middle."""
+    z = np.arange(g.shape[1])
+    middle = len(z) // 2
+    whole = np.stack([np.interp(z, z[np.isfinite(c)], c[np.isfinite(c)]) for c in g])
+    below = np.minimum.accumulate(whole[:, middle::-1], axis=1)[:, ::-1]
+    above = np.maximum.accumulate(whole[:, middle:], axis=1)
+    return np.concatenate([below, above[:, 1:]], axis=1) + RISE * z
 
 
 @cache
