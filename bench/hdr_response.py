@@ -218,6 +218,8 @@ def _row(what: str, tool: str, runs: Runs, of: Literal["error", "shown"] = "erro
             f"{len(mine)} of {len(ours)} runs; {OURS} on these: median {np.median(same):.4f}, "
             f"worst {max(same):.4f}"
         )
+    if hidden := sum(np.isfinite(run.error) and not np.isfinite(error(run)) for run in mine):
+        notes.append(f"no channel shown in {hidden} runs")
     refused = sum(run.missing == 3 * 256 for run in mine)
     if refused:
         notes.append(f"refuses {refused} of {len(mine)} runs")

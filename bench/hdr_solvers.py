@@ -6,6 +6,7 @@ Each gives ln exposure (C, 256), zero at code 128, NaN where it says nothing fin
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -21,7 +22,8 @@ from scipy.spatial.distance import squareform
 
 from chromeball.bench.hdr import dorf
 from chromeball.hdr.prior import FAMILY, Prior, distances, from_curves, inverse_curves
-from chromeball.hdr.response import sample, solve
+from chromeball.hdr.response import Solution, sample, solve
+from chromeball.hdr.response_file import Response
 
 type Float = NDArray[np.float64]
 type Frames = list[NDArray[np.uint8]]
@@ -46,6 +48,12 @@ def comparagram_shipped(frames: Frames, times: Float, prior: Prior | None) -> Fl
 def debevec(frames: Frames, times: Float, prior: Prior | None) -> Float:
     """Our Debevec and Malik, from all pixels."""
     return solve([sample(frame) for frame in frames], times, method="debevec").g
+
+
+def as_response(found: Solution) -> Response:
+    """Curve, standard error and code noise, as `hdr merge` is given them."""
+    known = Response.from_log_exposure(found.g)
+    return replace(known, sigma=found.sigma, code_noise=found.code_noise)
 
 
 def opencv_debevec(frames: Frames, times: Float, prior: Prior | None) -> Float:
