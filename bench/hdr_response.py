@@ -13,10 +13,6 @@ What is left is a matter of the bracket and of the curve: exact EV steps do not 
 period one step in g (Grossberg and Nayar 2004), the wider the step the less, and only the prior
 tells it from the curve. So a curve that no other family resembles is worst in steps of 2 EV;
 rows name it, and say how far its next relative is.
-
-Some maps hardly have light in a channel (the blue of StillLife): its codes are shown by no two
-frames, and what is judged there is the prior, or the smoothness. "Channels shown" leaves such
-channels out, by a count of pixels that no tool has a part in.
 """
 
 from __future__ import annotations
@@ -25,11 +21,8 @@ import sys
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from itertools import pairwise
-from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from chromeball.bench import hdr as room
 from chromeball.bench import hdr_solvers as solvers
@@ -51,8 +44,6 @@ SLOW: dict[str, Solver] = {
 }
 #: slow tools take one run of so many
 SHARE = len(room.MAPS)
-#: a code is shown by so many pixels of every fourth, a channel by this share of its codes
-SHOWING, SHOWN = 20, 0.9
 
 
 @dataclass(frozen=True)
@@ -68,7 +59,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Run:
-    """What one solver made of a case: NaN errors where it refused; `shown` of channels shown.
+    """What one solver made of a case, NaN where it refused.
 
     `missing` and `falling` count codes of 3 x 256.
     """
@@ -79,7 +70,6 @@ class Run:
     everyone: bool
     seconds: float
     error: float
-    shown: float
     missing: int
     falling: int
 
@@ -101,13 +91,12 @@ def compile_ours() -> None:
 
 
 def accuracy_rows(quick: bool) -> list[Row]:
-    """Median and worst error by the protocol: all, where channels are shown, by bracket."""
+    """Median and worst error by the protocol: altogether, and by bracket."""
     runs = judge(cases(quick), FAST | SLOW)
     found = [_row("response", tool, runs) for tool in runs]
-    found += [_row("response, channels shown", tool, runs, "shown") for tool in runs]
     for bracket in room.BRACKETS:
         own = {tool: [r for r in mine if r.bracket == bracket] for tool, mine in runs.items()}
-        found += [_row(f"response, channels shown, {bracket}", t, own, "shown") for t in FAST]
+        found += [_row(f"response, {bracket}", tool, own) for tool in FAST]
     return found
 
 
@@ -146,7 +135,6 @@ def judge(cases: Iterable[Case], tools: dict[str, Solver]) -> Runs:
     for case in cases:
         prior = solvers.unseen(case.number)
         _, truth = room.curve(case.number)
-        shown = shown_channels(case.frames)
         for tool, solver in tools.items():
             if tool in SLOW and not case.everyone:
                 continue
@@ -164,8 +152,7 @@ def judge(cases: Iterable[Case], tools: dict[str, Solver]) -> Runs:
                     case.bracket,
                     case.everyone,
                     seconds,
-                    _root_mean(squares),
-                    _root_mean(squares[shown]),
+                    float(np.sqrt(np.nanmean(squares))) if np.isfinite(g).any() else np.nan,
                     int(np.isnan(g).sum()),
                     int((np.diff(g) <= 0).sum()),
                 )
@@ -173,35 +160,14 @@ def judge(cases: Iterable[Case], tools: dict[str, Solver]) -> Runs:
     return runs
 
 
-def shown_channels(frames: room.Frames) -> NDArray[np.bool_]:
-    """Channels (3,) most of whose codes 5 .. 250 two neighbouring frames show in one place."""
-    count = np.zeros((3, 256))
-    some = [frame[::2, ::2] for frame in frames]
-    for c in range(3):
-        for one, other in pairwise(some):
-            a, b = one[..., c], other[..., c]
-            both = (np.minimum(a, b) >= 5) & (np.maximum(a, b) <= 250)
-            count[c] += np.bincount(a[both], minlength=256)
-            count[c] += np.bincount(b[both], minlength=256)
-    return np.mean(count[:, 5:251] >= SHOWING, axis=1) >= SHOWN
-
-
-def _root_mean(squares: NDArray[np.float64]) -> float:
-    known = squares[np.isfinite(squares)]
-    return float(np.sqrt(np.mean(known))) if known.size else np.nan
-
-
-def _row(what: str, tool: str, runs: Runs, of: Literal["error", "shown"] = "error") -> Row:
-    def error(run: Run) -> float:
-        return run.error if of == "error" else run.shown
-
+def _row(what: str, tool: str, runs: Runs) -> Row:
     def errors(some: Iterable[Run]) -> list[float]:
-        return [e for e in map(error, some) if np.isfinite(e)]
+        return [run.error for run in some if np.isfinite(run.error)]
 
     mine, ours = runs[tool], runs[OURS]
-    worst = max(mine, key=lambda run: np.nan_to_num(error(run)))
+    worst = max(mine, key=lambda run: np.nan_to_num(run.error))
     notes = [
-        f"worst {error(worst):.4f}: curve {worst.number}, {worst.map}, {worst.bracket}, next "
+        f"worst {worst.error:.4f}: curve {worst.number}, {worst.map}, {worst.bracket}, next "
         f"relative {solvers.strangeness(worst.number):.2f} away"
     ]
     if len(mine) < len(ours):
@@ -210,8 +176,6 @@ def _row(what: str, tool: str, runs: Runs, of: Literal["error", "shown"] = "erro
             f"{len(mine)} of {len(ours)} runs; {OURS} on these: median {np.median(same):.4f}, "
             f"worst {max(same):.4f}"
         )
-    if hidden := sum(np.isfinite(run.error) and not np.isfinite(error(run)) for run in mine):
-        notes.append(f"no channel shown in {hidden} runs")
     refused = sum(run.missing == 3 * 256 for run in mine)
     if refused:
         notes.append(f"refuses {refused} of {len(mine)} runs")
