@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from chromeball.hdr.exposure import contradictions, transmissions
+from chromeball.hdr.exposure import contradictions, exact_times, transmissions
 from chromeball.scene.errors import UserError
 from chromeball.scene.image import RAW_SUFFIXES, Exposure, read_exposure, read_image
 from chromeball.scene.raw import Mosaic, read_mosaic
@@ -34,6 +34,9 @@ class Frame:
     iso: float | None = None
     camera: str | None = None
     scene: int = 0  # a take is one scene, the pictures named one by one are another
+    transform: NDArray[np.float64] | None = (
+        None  # (3, 3) to its reference, where it is resampled
+    )
 
 
 @dataclass(frozen=True)
@@ -50,6 +53,35 @@ class Bracket:
     def paths(self) -> list[Path]:
         """The pictures in order."""
         return [frame.path for frame in self.frames]
+
+    def moved_by(self, motions: Sequence[str | os.PathLike[str]]) -> Bracket:
+        """The bracket with the transforms of ``motion.json`` files, one for each frame.
+
+        Raises
+        ------
+        UserError
+            A frame that none of them holds.
+
+        """
+        from chromeball.hdr.motion import read_motion
+
+        known = [read_motion(path) for path in motions]
+        frames: list[Frame] = []
+        for frame in self.frames:
+            whole = Path(os.path.abspath(frame.path))
+            own = next((motion for motion in known if whole in motion.files), None)
+            if own is None:
+                raise UserError(
+                    f"not in {', '.join(map(str, motions))}: run `hdr align` on these pictures",
+                    file=frame.path,
+                )
+            frames.append(replace(frame, transform=own.of(frame.path)))
+        return replace(self, frames=tuple(frames), inputs=(*self.inputs, *map(Path, motions)))
+
+    @property
+    def aligned(self) -> bool:
+        """Whether a frame is resampled on its way in."""
+        return any(frame.transform is not None for frame in self.frames)
 
     @property
     def raw(self) -> bool:
@@ -76,11 +108,14 @@ def read_bracket(
     inputs: Sequence[str | os.PathLike[str]],
     times: Sequence[float] | None = None,
     nd: Sequence[float] = (),
+    *,
+    exact: bool = False,
 ) -> Bracket:
     """Gather frames from pictures, take folders and ``take.json`` files.
 
     `times` (seconds, one a picture) override those of takes and metadata. `nd` are the stops of
     neutral-density filters, one for all pictures or one a picture; none where it is empty.
+    `exact` takes times for names of the shutter's series: 1/30 stands for 1/32 s.
 
     Raises
     ------
@@ -120,6 +155,14 @@ def read_bracket(
             if not (math.isfinite(time) and time > 0):
                 raise UserError(f"exposure time {time} is not a positive number of seconds")
         frames = [replace(f, time=float(t)) for f, t in zip(frames, times, strict=True)]
+    if exact:
+        series = exact_times([frame.time for frame in frames])
+        if series is None:
+            raise UserError(
+                "the exposure times are not those of a shutter's series (thirds or halves of a "
+                "stop): leave --exact-times out"
+            )
+        frames = [replace(f, time=float(t)) for f, t in zip(frames, series, strict=True)]
     exposures, scale = _exposures(frames)
     if nd:
         exposures, scale = exposures * transmissions(nd, len(frames)), f"{scale} * ND"
@@ -172,11 +215,12 @@ def pictures(bracket: Bracket, tell: Callable[[str], None]) -> Iterator[Picture]
     first: Picture | None = None
     ahead = min(2, os.cpu_count() or 1)
     with ThreadPoolExecutor(ahead) as pool:
-        waiting = [pool.submit(_read, path) for path in bracket.paths[:ahead]]
+        frames = bracket.frames
+        waiting = [pool.submit(_read_moved, frame) for frame in frames[:ahead]]
         for number, path in enumerate(bracket.paths):
             picture = waiting.pop(0).result()
-            if number + ahead < len(bracket.paths):
-                waiting.append(pool.submit(_read, bracket.paths[number + ahead]))
+            if number + ahead < len(frames):
+                waiting.append(pool.submit(_read_moved, frames[number + ahead]))
             first = first or picture
             _fits(first, picture)
             tell(f"{number + 1}/{len(bracket.paths)} {path.name}")
@@ -209,6 +253,22 @@ def mosaics(bracket: Bracket, tell: Callable[[str], None]) -> Iterator[Mosaic]:
                 )
         tell(f"{number + 1}/{len(bracket.paths)} {path.name}")
         yield mosaic
+
+
+def _read_moved(frame: Frame) -> Picture:
+    """A frame as it is, or resampled to the reference: black, no measurement, outside."""
+    picture = _read(frame.path)
+    if frame.transform is None:
+        return picture
+    from chromeball.hdr.align import warp
+
+    if picture.linear:
+        raise UserError(
+            "aligned frames of linear values cannot be merged: outside a frame there is no "
+            "value that means none; use codes (JPEG, TIFF), or a tripod",
+            file=frame.path,
+        )
+    return replace(picture, pixels=warp(picture.pixels, frame.transform)[0])
 
 
 def _read(path: Path) -> Picture:

@@ -11,7 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chromeball.hdr.bracket import Bracket, Picture, mosaics
-from chromeball.hdr.exposure import Luminance, luminance_scale
+from chromeball.hdr.exposure import (
+    Luminance,
+    Suspicion,
+    check_exposures,
+    luminance_scale,
+)
 from chromeball.hdr.merge import (
     SATURATED,
     SENSOR_NOISE,
@@ -283,6 +288,84 @@ def developed(
     }
 
 
+def deghosted(
+    frames: Frames,
+    exposures: Float,
+    prepared: Prepared,
+    response: Response | None,
+    white: float | None,
+) -> tuple[Radiance, dict[str, Any]]:
+    """A bracket merged whole, what moved taken from one exposure; and figures of it."""
+    from chromeball.hdr.ghost import find_ghosts
+    from chromeball.hdr.ghost import replace as replace_ghosts
+
+    if response is not None and response.codes != 256:
+        raise UserError("ghosts are found in 8-bit and in linear pictures; leave --deghost out")
+    chosen = list(prepared.chosen)
+    height = frames.shape[0]
+    held = frames.part(chosen, 0, height)
+    merged = prepared.merge(held, exposures[chosen])
+    given = [frames.bracket.frames[j].transform for j in chosen]
+    valid = None
+    if frames.bracket.aligned:
+        valid = [_inside(frames.shape[:2], transform) for transform in given]
+    curve = None if response is None else response.log_exposure
+    noise = np.ones(1) if response is None else response.code_noise
+    ghosts = find_ghosts(
+        held,
+        exposures[chosen],
+        curve,
+        noise,
+        sigma=None if response is None else response.sigma,
+        valid=valid,
+        white=white,
+    )
+    radiance, clipped = replace_ghosts(
+        merged.radiance,
+        merged.clipped,
+        held,
+        exposures[chosen],
+        curve,
+        ghosts,
+        valid=valid,
+        white=white,
+    )
+    error = merged.sigma
+    if error is not None:
+        for j in {region.frame for region in ghosts.regions}:
+            alone = prepared.merge([held[j]], exposures[chosen][[j]]).sigma
+            assert alone is not None  # as in the merge of all
+            taken = [r.frame == j for r in ghosts.regions]
+            here = np.array([False, *taken])[ghosts.labels]
+            error = np.where(here[..., None], alone, error).astype(np.float32)
+    names = [path.name for path in frames.bracket.paths]
+    largest = sorted(ghosts.regions, key=lambda region: -region.area)[:20]
+    return replace(merged, radiance=radiance, clipped=clipped, sigma=error), {
+        "ghost_regions": len(ghosts.regions),
+        "ghost_pixels": ghosts.pixels,
+        "ghost_share": ghosts.pixels / (height * frames.shape[1]),
+        "ghost_reference": names[chosen[ghosts.reference]],
+        "ghosts": [
+            {
+                "box": " ".join(map(str, region.box)),
+                "pixels": region.area,
+                "from": names[chosen[region.frame]],
+                "clipped": region.clipped,
+            }
+            for region in largest
+        ],
+    }
+
+
+def _inside(shape: tuple[int, int], transform: Float | None) -> NDArray[np.bool_]:
+    """Where a resampled frame has pixels, (H, W)."""
+    from chromeball.hdr.align import warp
+
+    if transform is None:
+        return np.ones(shape, bool)
+    return warp(np.ones((*shape, 1), np.uint8), transform)[1]
+
+
 def merge_bands(
     frames: Frames, exposures: Float, prepared: Prepared
 ) -> Iterator[tuple[int, Radiance]]:
@@ -405,6 +488,36 @@ def _fit_figures(fit: Fit) -> dict[str, Any]:
         "chi_square_by_range": fit.by_range,
         "outliers": fit.outliers,
     }
+
+
+def suspicious(
+    frames: Frames,
+    exposures: Float,
+    response: Response | None,
+    info: Mosaic | None,
+    white: float | None,
+) -> list[Suspicion]:
+    """Frames whose brightness contradicts their exposures, by the samples of all frames."""
+    if len(frames.samples) < 2:
+        return []
+    values = [sample.values for sample in frames.samples]
+    if response is not None:
+        if response.codes != 256 or frames.kind != np.uint8:
+            return check_exposures([np.exp(_looked_up(response, v)) for v in values], exposures)
+        return check_exposures(values, exposures, response.log_exposure)
+    if info is not None:
+        rows, columns = frames.lattice
+        dark, scale = (
+            tiled(cell, info.pixels.shape)[rows, columns].reshape(-1, 1)
+            for cell in (info.black, info.white - info.black)
+        )
+        return check_exposures([(v - dark) / scale for v in values], exposures, white=1.0)
+    top = white if white is not None else 65535.0 if frames.kind == np.uint16 else None
+    return check_exposures([v.astype(np.float64) for v in values], exposures, white=top)
+
+
+def _looked_up(response: Response, values: NDArray[Any]) -> Float:
+    return response.log_exposure[np.arange(values.shape[1]), values.astype(np.intp)]
 
 
 def read_luminance(

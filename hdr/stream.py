@@ -83,7 +83,11 @@ class Frames:
                 if pixels.nbytes <= room:
                     room -= pixels.nbytes
                     self._rows.append(_held(pixels))
-                elif self._files < MOST_FILES and _by_rows(picture.path):
+                elif (
+                    not self.bracket.aligned
+                    and self._files < MOST_FILES
+                    and _by_rows(picture.path)
+                ):
                     self._files += 1
                     self._rows.append(self._reader(picture))
                 else:

@@ -25,6 +25,19 @@ type Filters = Annotated[
     str | None,
     Parameter(help="Neutral-density filters in stops: one for all pictures, or 0,0,3,..."),
 ]
+type Exact = Annotated[
+    bool,
+    Parameter(
+        negative="", help="Times are names of the shutter's series: 1/30 stands for 1/32 s."
+    ),
+]
+type Motions = Annotated[
+    list[Path] | None,
+    Parameter(
+        help="motion.json of `hdr align` for hand-held frames; one a take.",
+        consume_multiple=True,
+    ),
+]
 type Output = Annotated[Path, Parameter(name=["--output", "-o"], help="Output file.")]
 type AsJson = Annotated[bool, Parameter(name="--json", negative="", help="Figures as JSON.")]
 
@@ -39,13 +52,102 @@ def parse_times(text: str | None) -> list[float] | None:
 
 
 @app.command
+def align(
+    inputs: Inputs,
+    /,
+    *,
+    output: Output,
+    times: Times = None,
+    response: Annotated[
+        Path | None, Parameter(help="response.json, if known; it is not needed.")
+    ] = None,
+    model: Annotated[
+        Literal["auto", "shift", "rotation", "homography"],
+        Parameter(help="What may move; auto: what the pictures tell."),
+    ] = "auto",
+    as_json: AsJson = False,
+) -> None:
+    """Find how the frames of a hand-held bracket lie to each other; pixels stay as they are."""
+    import numpy as np
+
+    from chromeball.hdr.align import MODELS, is_needed
+    from chromeball.hdr.align import align as find_motion
+    from chromeball.hdr.bracket import pictures, read_bracket
+    from chromeball.hdr.motion import encode_motion
+    from chromeball.hdr.response_file import exposures_for, read_response
+
+    bracket = read_bracket(inputs, parse_times(times))
+    _notes(bracket.notes)
+    curve = None if response is None else read_response(response)
+    exposures = bracket.exposures
+    if curve is not None:
+        names = [path.name for path in bracket.paths]
+        exposures, _ = exposures_for(curve, exposures, names)
+    check_output(output)
+    with Stage(
+        "hdr align",
+        inputs=[*bracket.inputs, *([] if response is None else [response])],
+        times=times,
+        model=model,
+    ) as stage:
+        frames = [picture.pixels for picture in pictures(bracket, _tell)]
+        known = curve.log_exposure if curve is not None and curve.codes == 256 else None
+        found = find_motion(
+            frames, exposures, known, models=tuple(MODELS) if model == "auto" else (model,)
+        )
+        size = frames[0].shape[1], frames[0].shape[0]
+        with stage.output(output) as temporary:
+            temporary.write_bytes(encode_motion(found, bracket.paths, size, output.parent))
+        needed = is_needed(found)
+        flagged = {
+            path.name: flag
+            for path, flag in zip(bracket.paths, found.flags, strict=True)
+            if flag
+        }
+        stage.figures |= {
+            "model": found.model,
+            "reference": bracket.paths[found.reference].name,
+            "needed": needed,
+            "largest_displacement_px": float(found.displacement.max()),
+            "flagged": flagged,
+            "frames": [
+                {
+                    "file": path.name,
+                    "displacement_px": float(found.displacement[k]),
+                    "standard_error_px": float(found.sigma[k]),
+                    "halves_differ_px": float(found.split[k]),
+                    "tiles": int(found.tiles[k]),
+                    "flag": found.flags[k],
+                }
+                for k, path in enumerate(bracket.paths)
+            ],
+        }
+        for name, flag in flagged.items():
+            _tell(f"{name}: {flag}")
+    sure = found.sigma[np.isfinite(found.sigma)]
+    _report(
+        output,
+        as_json,
+        [
+            f"model {found.model}, reference {bracket.paths[found.reference].name}",
+            f"moved by up to {found.displacement.max():.2f} px, standard error "
+            f"{sure.max() if sure.size else np.inf:.2f} px",
+            "alignment is needed" if needed else "no frame moved: nothing will be resampled",
+            *(f"{name}: not to be trusted, {flag}" for name, flag in flagged.items()),
+        ],
+    )
+
+
+@app.command
 def response(
     inputs: Inputs,
     /,
     *,
     output: Output,
     times: Times = None,
+    exact_times: Exact = False,
     nd: Filters = None,
+    motion: Motions = None,
     method: Annotated[
         Literal["comparagram", "debevec"],
         Parameter(help="With a prior over real curves; or Debevec and Malik as published."),
@@ -80,8 +182,10 @@ def response(
 
     if method != "debevec" and smoothness is not None:
         raise UserError("--smoothness is lambda of --method debevec: leave it out")
-    bracket = read_bracket(inputs, parse_times(times), parse_stops(nd))
+    bracket = read_bracket(inputs, parse_times(times), parse_stops(nd), exact=exact_times)
     _notes(bracket.notes)
+    if motion:
+        bracket = bracket.moved_by(motion)
     stored = read_response(reuse) if reuse is not None and reuse.is_file() else None
     if reuse is not None and stored is None:
         _tell(f"{reuse}: no stored response; solving one")
@@ -90,6 +194,7 @@ def response(
         "hdr response",
         inputs=[*bracket.inputs, *([reuse] if reuse is not None and stored else [])],
         times=times,
+        exact_times=exact_times,
         nd=nd,
         method=method,
         smoothness=smoothness,
@@ -143,7 +248,15 @@ def merge(
     *,
     output: Output,
     times: Times = None,
+    exact_times: Exact = False,
     nd: Filters = None,
+    motion: Motions = None,
+    deghost: Annotated[
+        bool,
+        Parameter(
+            negative="", help="Take what moved from one exposure; frames are kept in memory."
+        ),
+    ] = False,
     response: Annotated[
         Path | None, Parameter(help="response.json of the camera; needed unless linear.")
     ] = None,
@@ -195,6 +308,7 @@ def merge(
     from chromeball.hdr.bracket import Picture, pictures, read_bracket
     from chromeball.hdr.merge_files import (
         Sensor,
+        deghosted,
         developed,
         merge_bands,
         prepare_codes,
@@ -202,6 +316,7 @@ def merge(
         prepare_sensor,
         read_luminance,
         scaled,
+        suspicious,
         write_merged,
     )
     from chromeball.hdr.plots import plot_radiance
@@ -215,10 +330,16 @@ def merge(
     if not (memory >= 0):
         raise UserError(f"--memory {memory:g}: give gigabytes, 0 or more")
     reading = _reading(luminance, grey_card, at, scale_from)
-    bracket = read_bracket(inputs, parse_times(times), parse_stops(nd))
+    bracket = read_bracket(inputs, parse_times(times), parse_stops(nd), exact=exact_times)
     _notes(bracket.notes)
+    if motion:
+        bracket = bracket.moved_by(motion)
     balance = _balance(white_balance)
     odd = no_bayer(bracket.paths[0]) if bracket.raw else None
+    if bracket.raw and deghost:
+        raise UserError("--deghost is for pictures with their colours, not for RAW mosaics")
+    if bracket.raw and bracket.aligned:
+        raise UserError("RAW mosaics cannot be resampled: leave --motion out")
     if odd:
         _tell(f"{bracket.paths[0].name} is no Bayer mosaic ({odd}): merging LibRaw's pictures")
     sensor = Sensor() if bracket.raw and not odd else None
@@ -258,7 +379,9 @@ def merge(
                 *(path for path in (response, scale_from) if path is not None),
             ],
             times=times,
+            exact_times=exact_times,
             nd=nd,
+            deghost=deghost,
             sigma=sigma,
             white=white,
             noise=noise,
@@ -293,7 +416,16 @@ def merge(
             )
         else:
             prepared = prepare_codes(frames, exposures, curve, sigma=sigma, snr=snr)
+        if deghost:
+            whole, found = deghosted(frames, exposures, prepared, curve, white)
+            stage.figures |= found
         names = [path.name for path in bracket.paths]
+        suspicions = suspicious(
+            frames, exposures, curve, sensor.info if sensor else None, white
+        )
+        for suspicion in suspicions:
+            _tell(suspicion.message(names[suspicion.frame]))
+        stage.figures["suspicious_exposures"] = {names[s.frame]: s.ratio for s in suspicions}
         for number, reason in prepared.idle.items():
             _tell(f"{names[number]} measures nothing: {reason}")
         used = [names[j] for j in prepared.chosen]
@@ -366,6 +498,11 @@ def merge(
             f"noise from {prepared.figures['noise_from']}, "
             f"chi-square {_each(prepared.figures['chi_square'], '.2f')}",
             f"exposure scale {bracket.scale}{unit}",
+            *(
+                [f"{stage.figures['ghost_regions']} ghosts, {stage.figures['ghost_share']:.2%}"]
+                if deghost
+                else []
+            ),
         ],
     )
 

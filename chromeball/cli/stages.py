@@ -16,13 +16,13 @@ from typing import Any
 import msgspec
 
 from chromeball.scene.errors import UserError
-from chromeball.scene.manifest import Bracket, Lens, Quad, Scene, View
+from chromeball.scene.manifest import Bracket, Lens, Meter, Quad, Scene, View
 
 # the suffixes of `chromeball.scene.image`, which is too heavy to import for a plan
-LINEAR_SUFFIXES = frozenset(
-    {".exr", ".hdr", ".pfm", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"}
-    | {".pef", ".srw"}
+RAW_SUFFIXES = frozenset(
+    {".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw"}
 )
+LINEAR_SUFFIXES = frozenset({".exr", ".hdr", ".pfm"}) | RAW_SUFFIXES
 REPORT = "report.html"
 
 
@@ -111,8 +111,11 @@ class _Planner:
         plan: list[StagePlan] = []
         for bracket in scene.bracket:
             plan.append(self._take(bracket, plan))
+        plan += [self._hand(bracket) for bracket in scene.bracket if bracket.handheld]
         plan.append(self._response())
-        plan += [self._merge(bracket) for bracket in scene.bracket]
+        metered = scene.hdr.meter.bracket if scene.hdr.meter else None
+        first = sorted(scene.bracket, key=lambda bracket: bracket.name != metered)
+        plan += [self._merge(bracket) for bracket in first]
         plan += [self._lens(), self._align(), self._probe()]
         plan += [self._pose(view) for view in scene.view]
         plan += self._stand_in()
@@ -183,15 +186,22 @@ class _Planner:
     def _folder_of(self, bracket: Bracket) -> str:
         return (bracket.take or f"takes/{bracket.name}").rstrip("/")
 
+    def _names_of(self, bracket: Bracket) -> list[str]:
+        """The frames as far as they are known before a device takes them."""
+        if bracket.device or bracket.emulate:
+            return []
+        if bracket.frames:
+            return self._expanded(bracket)
+        return _frames_of_take(self.root / self._folder_of(bracket) / "take.json")
+
+    def _is_raw(self, bracket: Bracket) -> bool:
+        names = self._names_of(bracket)
+        return bool(names) and all(Path(n).suffix.lower() in RAW_SUFFIXES for n in names)
+
     def _is_linear(self, bracket: Bracket) -> bool:
         if bracket.name in self.linear:
             return self.linear[bracket.name]
-        if bracket.device or bracket.emulate:
-            names = []
-        elif bracket.frames:
-            names = self._expanded(bracket)
-        else:
-            names = _frames_of_take(self.root / self._folder_of(bracket) / "take.json")
+        names = self._names_of(bracket)
         kinds = {Path(name).suffix.lower() in LINEAR_SUFFIXES for name in names}
         if len(kinds) > 1:
             raise UserError(f"bracket {bracket.name!r} mixes linear frames with others")
@@ -304,6 +314,29 @@ class _Planner:
     def _solves(self, bracket: Bracket) -> bool:
         return any(bracket.name == other.name for other in self._solving())
 
+    def _motion(self, bracket: Bracket) -> str:
+        return f"{self.build}/{bracket.name}.motion.json"
+
+    def _hand(self, bracket: Bracket) -> StagePlan:
+        name = f"hdr align {bracket.name}"
+        if self._is_linear(bracket):
+            raise UserError(
+                f"bracket {bracket.name!r} is handheld, and its frames are linear: these "
+                "cannot be resampled"
+            )
+        if not self._users(bracket) and not self._solves(bracket):
+            return StagePlan(name, False, "no shot and no view uses it")
+        take, output = self._folder_of(bracket), self._motion(bracket)
+        return StagePlan(
+            name,
+            True,
+            "the camera was held by hand",
+            (f"{take}/take.json",),
+            (output,),
+            ("chromeball", "hdr", "align", take, "-o", output),
+            {},
+        )
+
     def _response(self) -> StagePlan:
         name = "hdr response"
         if self.scene.hdr.response:
@@ -315,18 +348,32 @@ class _Planner:
                 name, False, "all frames are linear" if any_used else "no bracket is in use"
             )
         takes = [self._folder_of(bracket) for bracket in brackets]
-        smoothness = self.scene.hdr.smoothness
+        hdr = self.scene.hdr
         output = f"{self.build}/response.json"
+        motion = [self._motion(b) for b in brackets if b.handheld]
+        if motion and not all(bracket.handheld for bracket in brackets):
+            raise UserError(
+                "hdr.solve_from: brackets held by hand and on a tripod; name one kind"
+            )
+        filters = {tuple(bracket.nd) for bracket in brackets}
+        if len(filters) > 1 or (len(brackets) > 1 and len(max(filters)) > 1):
+            raise UserError(
+                "hdr.solve_from: brackets of different ND filters; name those of one filter"
+            )
         return StagePlan(
             name,
             True,
             f"the frames of {', '.join(b.name for b in self._coded())} are not linear",
-            tuple(f"{take}/take.json" for take in takes),
+            (*(f"{take}/take.json" for take in takes), *motion),
             (output,),
             (
                 *("chromeball", "hdr", "response", *takes),
-                *(_option("smoothness", f"{smoothness:.10g}") if smoothness else ()),
-                *(("--refine-times",) if self.scene.hdr.refine_times else ()),
+                *_filters(brackets[0]),
+                *(("--motion", *motion) if motion else ()),
+                *(_option("method", hdr.method) if hdr.method != "comparagram" else ()),
+                *(_option("smoothness", f"{hdr.smoothness:.10g}") if hdr.smoothness else ()),
+                *_refining(hdr.refine_times),
+                *(_option("reuse", hdr.reuse) if hdr.reuse else ()),
                 *("-o", output),
             ),
             {},
@@ -348,13 +395,30 @@ class _Planner:
             response = self.scene.hdr.response or f"{self.build}/response.json"
             inputs.append(response)
             curve = _option("response", response)
+        options = [*_filters(bracket), *curve]
+        if bracket.handheld:
+            inputs.append(self._motion(bracket))
+            options += ["--motion", self._motion(bracket)]
+        if bracket.moving:
+            options.append("--deghost")
+        hdr = self.scene.hdr
+        if hdr.snr:
+            options += _option("snr", f"{hdr.snr:.10g}")
+        if hdr.white_balance and self._is_raw(bracket):
+            options += _option("white-balance", hdr.white_balance)
+        if hdr.meter and hdr.meter.bracket == bracket.name:
+            options += _metered(hdr.meter)
+        elif hdr.meter:
+            source = f"{self.build}/{hdr.meter.bracket}.exr"
+            inputs.append(source)
+            options += _option("scale-from", source)
         return StagePlan(
             name,
             True,
             f"radiance for {', '.join(users)}",
             tuple(inputs),
             (output,),
-            ("chromeball", "hdr", "merge", take, *curve, "-o", output),
+            ("chromeball", "hdr", "merge", take, *options, "-o", output),
             {},
         )
 
@@ -617,6 +681,24 @@ def points_text(points: Quad) -> str:
 def _option(name: str, value: str) -> tuple[str, ...]:
     """``--name value``; a value that begins with a minus sign is tied to its name."""
     return (f"--{name}={value}",) if value.startswith("-") else (f"--{name}", value)
+
+
+def _filters(bracket: Bracket) -> tuple[str, ...]:
+    return _option("nd", ",".join(f"{v:.10g}" for v in bracket.nd)) if bracket.nd else ()
+
+
+def _refining(refine: bool | None) -> tuple[str, ...]:
+    if refine is None:
+        return ()
+    return ("--refine-times",) if refine else ("--no-refine-times",)
+
+
+def _metered(meter: Meter) -> tuple[str, ...]:
+    place = ",".join(map(str, meter.at))
+    if meter.luminance is not None:
+        return "--luminance", f"{meter.luminance:.10g}", "--at", place
+    card = f"{meter.reflectance:.10g}", f"{meter.illuminance:.10g}"
+    return "--grey-card", *card, "--at", place
 
 
 def _plain(name: str) -> str:

@@ -45,7 +45,9 @@ class Bracket(Table, frozen=True):
 
     ``frames`` are paths or patterns; ``times`` their exposure times (seconds or "1/30") where
     the pictures' metadata is silent. With ``device`` (``visca:/dev/ttyUSB0``) and ``video``
-    (``v4l2:/dev/video0``), `acquire bracket` makes ``take``.
+    (``v4l2:/dev/video0``), `acquire bracket` makes ``take``. ``nd``: stops of the
+    neutral-density filter, one for all frames or one a frame. ``handheld``: the frames are
+    aligned; ``moving``: what moved is taken from one exposure.
     """
 
     name: Name
@@ -55,19 +57,46 @@ class Bracket(Table, frozen=True):
     device: str | None = None
     video: str | None = None
     emulate: Emulate | None = None
+    nd: list[float] = []
+    handheld: bool = False
+    moving: bool = False
+
+
+class Meter(Table, frozen=True):
+    """A light-meter reading: what makes radiance absolute, in all brackets of the scene.
+
+    In the merged picture of ``bracket``, the place ``at`` (x, y or x, y, width, height in
+    pixels) has ``luminance`` cd/m^2, or is a grey card of ``reflectance`` under ``illuminance``
+    lux.
+    """
+
+    bracket: Name
+    at: list[int]
+    luminance: Positive | None = None
+    reflectance: Positive | None = None
+    illuminance: Positive | None = None
 
 
 class Hdr(Table, frozen=True):
-    """Response and merge. ``response``: a stored curve; else it is solved from ``solve_from``.
+    """Response and merge. ``response``: a known curve; else it is solved from ``solve_from``.
 
-    ``smoothness`` is Debevec and Malik's lambda. ``refine_times``: the metadata's times are
-    nominal; solve them too, the span from shortest to longest fixed.
+    ``method``: ``comparagram``, with a prior over real curves, or ``debevec`` as published,
+    ``smoothness`` its lambda. ``refine_times``: the metadata's times are nominal, solved too,
+    their span fixed; unless given, where the pictures say so. ``reuse``: a stored curve of the
+    camera, kept while it fits the pictures. ``snr``: exposures that are not needed for this
+    signal-to-noise ratio are left out. ``white_balance`` of RAW brackets: camera, daylight,
+    none or "r,g,b".
     """
 
     response: str | None = None
     solve_from: list[Name] = []
+    method: Literal["comparagram", "debevec"] = "comparagram"
     smoothness: Positive | None = None
-    refine_times: bool = False
+    refine_times: bool | None = None
+    reuse: str | None = None
+    snr: Positive | None = None
+    white_balance: str | None = None
+    meter: Meter | None = None
 
 
 class Lens(Table, frozen=True):
@@ -322,11 +351,29 @@ def _check_names(scene: Scene) -> None:
     used = [shot.bracket for shot in (scene.probe.shot if scene.probe else [])]
     used += [view.bracket for view in scene.view if view.bracket]
     used += scene.hdr.solve_from
+    if scene.hdr.meter is not None:
+        used.append(scene.hdr.meter.bracket)
     for name in used:
         scene.find_bracket(name)
     for bracket in scene.bracket:
         for time in bracket.times:
             parse_time(time)
+    _check_hdr(scene.hdr)
+
+
+def _check_hdr(hdr: Hdr) -> None:
+    if hdr.smoothness is not None and hdr.method != "debevec":
+        raise UserError('hdr.smoothness is lambda of method = "debevec": leave it out')
+    meter = hdr.meter
+    if meter is None:
+        return
+    if len(meter.at) not in (2, 4):
+        raise UserError("hdr.meter.at: give x, y or x, y, width, height in pixels")
+    card = (meter.reflectance, meter.illuminance)
+    if (meter.luminance is None) == (None in card) or (
+        meter.luminance is not None and card != (None, None)
+    ):
+        raise UserError("hdr.meter needs luminance, or reflectance and illuminance")
 
 
 def _check_numbers(scene: Scene) -> None:

@@ -87,6 +87,53 @@ def test_a_finished_panorama_is_turned_and_not_stitched(root: Path) -> None:
 def test_refined_times_reach_the_solver(root: Path) -> None:
     text = changed("spp = 64", "spp = 64\n[hdr]\nrefine_times = true")
     assert "--refine-times" in planned(text, root)["hdr response"].command
+    text = changed("spp = 64", "spp = 64\n[hdr]\nrefine_times = false")
+    assert "--no-refine-times" in planned(text, root)["hdr response"].command
+
+
+def test_a_hand_held_bracket_is_aligned_first(root: Path) -> None:
+    text = changed('name = "front"', 'name = "front"\nhandheld = true\nmoving = true\nnd = [3]')
+    plan = planned(text, root)
+    motion = "build/front.motion.json"
+    assert plan["hdr align front"].outputs == (motion,)
+    assert motion in plan["hdr response"].inputs
+    assert motion in plan["hdr merge front"].inputs
+    command = plan["hdr merge front"].command
+    assert command[command.index("--motion") + 1] == motion
+    assert "--deghost" in command
+    assert command[command.index("--nd") + 1] == "3"
+    assert "hdr align back" not in plan
+
+
+def test_a_light_meter_gives_one_scale_to_all_brackets(root: Path) -> None:
+    meter = '[hdr.meter]\nbracket = "plate"\nat = [10, 20]\n'
+    plan = planned(changed("[render]", meter + "luminance = 250\n[render]"), root)
+    command = plan["hdr merge plate"].command
+    assert command[command.index("--luminance") :][:4] == (
+        "--luminance",
+        "250",
+        "--at",
+        "10,20",
+    )
+    assert "build/plate.exr" in plan["hdr merge front"].inputs
+    assert "--scale-from" in plan["hdr merge front"].command
+    names = list(plan)
+    assert names.index("hdr merge plate") < names.index("hdr merge front")
+    card = "reflectance = 0.18\nilluminance = 1000\n[render]"
+    plan = planned(changed("[render]", meter + card), root)
+    assert "--grey-card" in plan["hdr merge plate"].command
+    for wrong in ("[render]", "reflectance = 0.2\n[render]", "luminance = 2\n" + card):
+        with pytest.raises(UserError, match="meter needs"):
+            planned(changed("[render]", meter + wrong), root)
+
+
+def test_brackets_of_one_curve_have_one_filter_and_one_stand(root: Path) -> None:
+    both = '\n[hdr]\nsolve_from = ["front", "back"]\n'
+    for line, message in (("nd = [3]", "ND filters"), ("handheld = true", "by hand")):
+        text = changed('name = "front"', f'name = "front"\n{line}')
+        text = text.replace("spp = 64", "spp = 64" + both)
+        with pytest.raises(UserError, match=message):
+            planned(text, root)
 
 
 def test_values_that_begin_with_a_minus_sign_are_tied_to_their_option(root: Path) -> None:
@@ -225,11 +272,14 @@ def test_a_finished_take_tells_whether_its_frames_are_linear(tmp_path: Path) -> 
 
 def test_the_response_is_solved_from_what_is_named(root: Path) -> None:
     text = changed(
-        "spp = 64", 'spp = 64\n[hdr]\nsolve_from = ["back", "plate"]\nsmoothness = 2'
+        "spp = 64",
+        'spp = 64\n[hdr]\nsolve_from = ["back", "plate"]\nmethod = "debevec"\nsmoothness = 2',
     )
-    assert planned(text, root)["hdr response"].command[3:7] == (
+    assert planned(text, root)["hdr response"].command[3:9] == (
         "takes/back",
         "takes/plate",
+        "--method",
+        "debevec",
         "--smoothness",
         "2",
     )

@@ -169,6 +169,40 @@ def test_a_wrong_exposure_is_named_and_mended(
     assert np.median(np.abs(ratio[measured] - 1)) < 0.015
 
 
+def test_a_merge_names_exposures_that_contradict_the_pictures(
+    bracket: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With a stored response, and with linear pictures that need none."""
+    run("hdr", "response", *bracket, "--times", LIST, "-o", tmp_path / "r.json")
+    times = TIMES.copy()
+    times[2] *= 2
+    wrong = ",".join(f"{t}" for t in times)
+    known = ("--response", tmp_path / "r.json")
+    run("hdr", "merge", *bracket, "--times", wrong, *known, "-o", tmp_path / "m.exr")
+    assert "frame2.png: its exposure is stated as 1" in capsys.readouterr().err
+    figures = json.loads((tmp_path / "m.exr.record.json").read_text())["figures"]
+    assert figures["suspicious_exposures"]["frame2.png"] == pytest.approx(0.5, abs=0.02)
+    run("hdr", "merge", *bracket, "--times", LIST, *known, "-o", tmp_path / "m.exr")
+    assert "its exposure is" not in capsys.readouterr().err
+    linear = [tmp_path / f"{j}.exr" for j in range(len(TIMES))]
+    for path, t in zip(linear, TIMES, strict=True):
+        write_exr(path, np.minimum(scene(64, 80) * t, 1))
+    run("hdr", "merge", *linear, "--times", wrong, "-o", tmp_path / "m.exr")
+    assert "2.exr: its exposure is stated as 1" in capsys.readouterr().err
+
+
+def test_exact_times_are_powers_of_two(bracket: list[Path], tmp_path: Path) -> None:
+    named = "1/8,1/4,1/2,1,2,4,8"
+    run("hdr", "response", *bracket, "--times", named, "-o", tmp_path / "r.json")
+    words = ("hdr", "merge", *bracket, "--response", tmp_path / "r.json")
+    names = "1/15,1/8,1/4,1/2,1,2,4"  # 1/15 stands for 1/16
+    run(*words, "--times", names, "--exact-times", "-o", tmp_path / "m.exr")
+    exposures = read_image(tmp_path / "m.exr").attributes["exposures"]
+    np.testing.assert_allclose(sorted(exposures), np.exp2(np.arange(-4.0, 3)), rtol=1e-6)
+    with pytest.raises(UserError, match="not those of a shutter's series"):
+        run(*words, "--times", "1/7,1/5,1/2,1,2,4,8", "--exact-times", "-o", tmp_path / "n.exr")
+
+
 def test_merge_does_not_load_jax(bracket: list[Path], tmp_path: Path) -> None:
     run("hdr", "response", *bracket, "--times", LIST, "-o", tmp_path / "r.json")
     words = ["hdr", "merge", *bracket, "--times", LIST]

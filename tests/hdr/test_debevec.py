@@ -134,3 +134,32 @@ def test_the_same_curve_as_the_papers_own_solver(gamma: float) -> None:
     ours = debevec(frames).g[1]
     assert np.sqrt(np.mean((ours - theirs)[middle] ** 2)) < 0.02
     assert np.sqrt(np.mean((ours - truth)[middle] ** 2)) < 0.02
+
+
+def test_float64_is_needed_and_suffices() -> None:
+    """The normal equations in float32 fail or are far off; in float64 they equal a QR."""
+    pixels = [sample(f, 256, 1).patches for f in photograph(scene(96, 128))]
+    w = hat()
+    H = kernel.accumulate(pixels, w**2)[0][0]
+    D = second_difference(w)
+    keep = np.arange(256) != 128
+    scale = np.sum(w**2) / np.trace(H[:256, :256])
+    M = (scale * H[:256, :256] + 30 * D.T @ D)[np.ix_(keep, keep)]
+    right = (-scale * H[:256, 256:] @ np.log(TIMES))[keep]
+    # a route without normal equations: their factor [sqrt(s) L'; sqrt(30) D], by QR
+    values, vectors = np.linalg.eigh(H[:256, :256])
+    root = np.sqrt(scale * np.maximum(values, 0))[:, None] * vectors.T
+    A = np.vstack([root, np.sqrt(30) * D])[:, keep]
+    Q, R = np.linalg.qr(A)
+    b = np.concatenate(
+        [
+            (vectors.T @ (-scale * H[:256, 256:] @ np.log(TIMES)))
+            / np.sqrt(scale * np.maximum(values, 1e-9 * values[-1])),
+            np.zeros(len(D)),
+        ]
+    )
+    exact = np.linalg.solve(R, Q.T @ b)
+    double = np.linalg.solve(M, right)
+    assert np.abs(double - exact).max() < 1e-4
+    single = np.linalg.solve(M.astype(np.float32), right.astype(np.float32))
+    assert np.abs(single - double).max() > 100 * np.abs(double - exact).max()

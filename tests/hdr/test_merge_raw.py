@@ -109,3 +109,38 @@ def test_filters_count(bracket: list[Path], tmp_path: Path) -> None:
     run("hdr", "merge", *bracket, "--nd", 3, "-o", b)
     ratio = np.median(read_image(b).pixels[..., 1] / read_image(a).pixels[..., 1])
     assert ratio == pytest.approx(8, rel=1e-4)
+
+
+def _profiles() -> list[tuple[str, float, float]]:
+    """Sensors of darktable's measured noise profiles: a quiet, a usual and a loud one."""
+    data = Path(__file__).parents[2].parent / "shared/data/hdr/noise"
+    path = data / "darktable_noiseprofiles.json"
+    if not path.is_file():
+        return []
+    found = [
+        (profile["name"], profile["a"][1], profile["b"][1])
+        for maker in json.loads(path.read_text())["noiseprofiles"]
+        for model in maker["models"]
+        for profile in model["profiles"]
+        if profile["a"][1] > 0 and profile["b"][1] > 1e-10
+    ]
+    found.sort(key=lambda row: row[1])
+    return [found[int(share * (len(found) - 1))] for share in (0.02, 0.5, 0.95)]
+
+
+@pytest.mark.skipif(not _profiles(), reason="the shared data set is absent")
+@pytest.mark.parametrize("which", [0, 1, 2])
+def test_brackets_of_measured_sensors(tmp_path: Path, which: int) -> None:
+    _, a, b = _profiles()[which]
+    sensor = Sensor(noise=(a, b))
+    radiance = scene(160, 200)
+    paths = write_bracket(tmp_path, radiance, TIMES, sensor, seed=which)
+    out = tmp_path / "m.exr"
+    run("hdr", "merge", *paths, "--white-balance", "none", "--sigma", "-o", out)
+    figures = json.loads((tmp_path / "m.exr.record.json").read_text())["figures"]
+    found_a, found_b = figures["noise"][0]
+    assert found_a == pytest.approx(a, rel=0.15)
+    rounding = 1 / 12 / (15000 - 512) ** 2
+    assert found_b == pytest.approx(b + rounding, rel=0.5, abs=0.03 * a)
+    assert figures["chi_square"][0] == pytest.approx(1, abs=0.06)
+    assert figures["white_from"] == "metadata" or figures["white"][0][0] == pytest.approx(15000)

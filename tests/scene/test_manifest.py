@@ -32,6 +32,7 @@ frames = ["plate/*.jpg"]
 
 [hdr]
 solve_from = ["front"]
+method = "debevec"
 smoothness = 30
 
 [calibrate]

@@ -29,8 +29,10 @@ from chromeball.scene.record import Stage
 #: first words of a stage's name -> what it does
 DEEDS = {
     "take": "Frames of known exposure time, from a device or from photographs.",
+    "hdr align": "How the frames of a hand-held bracket lie to each other.",
     "hdr response": "The camera's response curve, solved from the same light at several "
-    "exposures (Debevec and Malik 1997).",
+    "exposures: joint histograms of neighbouring exposures and a prior over real curves, or "
+    "Debevec and Malik (1997).",
     "hdr merge": "The frames of a bracket merged to scene-linear radiance.",
     "calibrate lens": "Intrinsics and distortion of the lens, from photographs of a target.",
     "envmap align": "World axes and scale from the corners of a rectangle on the floor.",
