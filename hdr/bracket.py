@@ -165,13 +165,16 @@ def read_bracket(
         frames = [replace(f, time=float(t)) for f, t in zip(frames, series, strict=True)]
     exposures, scale = _exposures(frames)
     if nd:
-        exposures, scale = exposures * transmissions(nd, len(frames)), f"{scale} * ND"
+        exposures = exposures * transmissions(nd, len(frames))
     return Bracket(
         tuple(frames),
         exposures,
         scale,
         (*files, *(frame.path for frame in frames)),
-        tuple(f"{f.path.name}: {said}" for f in frames for said in contradictions(f.path)),
+        (
+            *(f"{f.path.name}: {said}" for f in frames for said in contradictions(f.path)),
+            *_unknown(frames),
+        ),
     )
 
 
@@ -202,6 +205,15 @@ def _exposures(frames: Sequence[Frame]) -> tuple[NDArray[np.float64], str]:
     return time, "time"
 
 
+def _unknown(frames: Sequence[Frame]) -> list[str]:
+    """Frames that keep the bracket from the session's scale."""
+    silent = [f for f in frames if f.aperture is None or f.iso is None]
+    if not silent or len(silent) == len(frames):
+        return []
+    names = ", ".join(frame.path.name for frame in silent)
+    return [f"{names}: no aperture or ISO, so the bracket's exposures are its times alone"]
+
+
 def pictures(bracket: Bracket, tell: Callable[[str], None]) -> Iterator[Picture]:
     """Read the frames in order, a few ahead, and see that they fit together.
 
@@ -209,7 +221,7 @@ def pictures(bracket: Bracket, tell: Callable[[str], None]) -> Iterator[Picture]
     ------
     UserError
         A picture that cannot be read, another size, depth or channels than the first, NaN
-        or negative values in a linear picture.
+        or infinite values in a linear picture.
 
     """
     first: Picture | None = None
@@ -293,12 +305,12 @@ def _read(path: Path) -> Picture:
         pixels = np.clip(pixels, 0, np.float32(0.98 * image.white))
         pixels[image.saturated] = image.white
     if pixels.dtype == np.float32:
-        bad = ~np.isfinite(pixels) | (pixels < 0)
+        bad = ~np.isfinite(pixels)  # negative values are noise about black, and kept
         if bad.any():
             y, x, _ = np.argwhere(bad)[0]
             raise UserError(
-                f"{int(bad.any(axis=2).sum())} pixels are NaN, infinite or negative, the first "
-                f"at x {x}, y {y}",
+                f"{int(bad.any(axis=2).sum())} pixels are NaN or infinite, the first at x {x}, "
+                f"y {y}",
                 file=path,
             )
     return Picture(path, pixels, tuple(chosen), image.linear, image.white)

@@ -91,6 +91,7 @@ def prepare_codes(
         "noise_code": noise.code,
         "noise_shot": noise.shot,
         "noise_read": noise.read,
+        "noise_over_response": _over_response(z, y, response),
         **_fit_figures(fit),
     }
 
@@ -99,6 +100,20 @@ def prepare_codes(
 
     idle = _idle(frames, tables.saturated)
     return Prepared(chosen, merge, idle, figures)
+
+
+def _over_response(z: NDArray[np.intp], y: Float, response: Response) -> float | None:
+    """Scatter about the response over that of the pictures it was solved from."""
+    if response.method == "given":
+        return None
+    tables = code_weights(response)
+    channel = np.arange(z.shape[2])
+    weight = tables.weight[channel, z] * unsaturated(z, tables.saturated)
+    taper = tables.taper[channel, z]
+    variance = np.where(weight > 0, taper, 1) / np.where(weight > 0, weight, 1)
+    found = chi_square(y, variance, weight > 0)
+    worst = np.nanmax(found.chi_square) if np.any(np.isfinite(found.chi_square)) else np.nan
+    return float(np.sqrt(worst)) if np.isfinite(worst) else None
 
 
 def prepare_linear(
@@ -112,10 +127,11 @@ def prepare_linear(
 ) -> Prepared:
     """Measure the noise of a linear bracket and decide which frames are merged."""
     if white is None:
-        peak = max(float(sample.largest.max()) for sample in frames.samples)
-        white = 65535.0 if frames.kind == np.uint16 else peak
-    if not white > 0:
-        raise UserError("all pictures are black: take longer exposures")
+        white = 65535.0 if frames.kind == np.uint16 else _piled_up(frames)
+        if not white > 0:
+            raise UserError("all pictures are black: take longer exposures")
+    elif not (np.isfinite(white) and white > 0):
+        raise UserError(f"--white {white:g}: give the value of a saturated pixel")
     order = np.argsort(exposures, kind="stable")
     x = np.stack([frames.samples[j].values for j in order]) / np.float64(white)
     prepared = _prepare_shares(frames, exposures, x, noise, snr)
@@ -126,6 +142,21 @@ def prepare_linear(
 
     figures = prepared.figures | {"white": white}
     return Prepared(prepared.chosen, merge, _idle(frames, SATURATED * top), figures)
+
+
+def _piled_up(frames: Frames) -> float:
+    """The value at which float frames saturate.
+
+    Clipped values are equal: the highest value that piles up, with next to nothing above it (a
+    hot pixel, a firefly); the largest of all where none does.
+    """
+    values = np.concatenate([sample.values.ravel() for sample in frames.samples])
+    found, counts = np.unique(values[values > 0], return_counts=True)
+    above = np.cumsum(counts[::-1])[::-1] - counts
+    piles = np.flatnonzero((counts >= 16) & (above <= counts / 20))
+    if piles.size:
+        return float(found[piles[np.argmax(counts[piles])]])
+    return max(float(sample.largest.max()) for sample in frames.samples)
 
 
 @dataclass(frozen=True)

@@ -69,8 +69,18 @@ class Motion:
 def encode_motion(
     alignment: Alignment, paths: Sequence[Path], size: tuple[int, int], folder: Path
 ) -> bytes:
-    """The bytes of a ``motion.json`` in `folder`, of frames of `size` width, height."""
+    """The bytes of a ``motion.json`` in `folder`, of frames of `size` width, height.
+
+    A frame whose own motion is not to be trusted gets that of its nearest neighbour.
+    """
     names = [os.path.relpath(path, folder) for path in paths]
+    transforms = alignment.transforms.copy()
+    sure = np.flatnonzero(alignment.confident)
+    for k in np.flatnonzero(~alignment.confident):
+        # the hand was there shortly before or after
+        transforms[k] = (
+            transforms[sure[np.argmin(np.abs(sure - k))]] if sure.size else np.eye(3)
+        )
     rows = [
         _Frame(
             name,
@@ -81,7 +91,7 @@ def encode_motion(
         )
         for name, transform, sigma, displacement, flag in zip(
             names,
-            alignment.transforms,
+            transforms,
             alignment.sigma,
             alignment.displacement,
             alignment.flags,

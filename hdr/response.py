@@ -202,6 +202,8 @@ def _comparagram(
     refined = bool(np.any(shift))
     if refined:
         log_exposures = log_exposures + shift
+        for far in np.flatnonzero(np.abs(shift) > WRONG).tolist():
+            wrong[far] = wrong.get(far, 0.0) + float(shift[far])
         fit = comparagram.fit(channels, pairs, log_exposures, mean, factors)
     g = np.stack(
         [
@@ -531,15 +533,19 @@ def _refuse(samples: Sequence[Sample], log_exposures: Float, smoothness: float) 
 
 
 def _refuse_few(channels: Sequence[Rows], samples: Sequence[Sample]) -> None:
-    told = min(len({*rows.b.tolist(), *np.floor(rows.T).tolist()}) for rows in channels)
+    knots = [len({*rows.b.tolist(), *np.floor(rows.T).tolist()}) for rows in channels]
+    told = min(knots)
+    which = ""
+    if told < max(knots):
+        which = f" in channel {knots.index(told) + 1} of {len(knots)}"
     if told == 0:
         raise UserError(
-            f"no code is shown by {comparagram.FEWEST} patches of {samples[0].patch} pixels "
-            "that are well exposed in two pictures: give exposures closer together, or "
+            f"no code{which} is shown by {comparagram.FEWEST} patches of {samples[0].patch} "
+            "pixels that are well exposed in two pictures: give exposures closer together, or "
             "pictures that are larger, less saturated and less dark"
         )
     if told < FEWEST_KNOTS:
         raise UserError(
-            f"the pictures tell of {told} code values: too few for a curve; photograph a "
-            "scene of more brightnesses"
+            f"the pictures tell of {told} code values{which}: too few for a curve; photograph "
+            "a scene of more brightnesses"
         )

@@ -20,6 +20,9 @@ from chromeball.scene.record import to_json
 
 type Float = NDArray[np.float64]
 
+#: ln exposure up to which a refined exposure may be a camera's rounding
+ROUNDED = 0.2
+
 
 class Exposed(Struct, frozen=True, forbid_unknown_fields=True):
     """A frame the curve was solved from: its exposure as given, and as used (refined)."""
@@ -199,7 +202,9 @@ def exposures_for(
             row for row in response.exposures if abs(math.log(row.given / exposure)) < tolerance
         ]
         own = [row for row in alike if k < len(names) and row.file == names[k]]
-        used = {row.used for row in own or alike}
+        # an exposure that was wrong, not rounded, is one frame's alone
+        rounded = [row for row in alike if abs(math.log(row.used / row.given)) < ROUNDED]
+        used = {row.used for row in own or rounded}
         if used and max(used) / min(used) < 1.02:
             result[k] = float(np.mean(list(used)))
             found += 1

@@ -58,6 +58,7 @@ def align(
     *,
     output: Output,
     times: Times = None,
+    nd: Filters = None,
     response: Annotated[
         Path | None, Parameter(help="response.json, if known; it is not needed.")
     ] = None,
@@ -70,24 +71,26 @@ def align(
     """Find how the frames of a hand-held bracket lie to each other; pixels stay as they are."""
     import numpy as np
 
-    from chromeball.hdr.align import MODELS, is_needed
     from chromeball.hdr.align import align as find_motion
+    from chromeball.hdr.align import is_needed
     from chromeball.hdr.bracket import pictures, read_bracket
+    from chromeball.hdr.match import MODELS
     from chromeball.hdr.motion import encode_motion
     from chromeball.hdr.response_file import exposures_for, read_response
 
-    bracket = read_bracket(inputs, parse_times(times))
+    bracket = read_bracket(inputs, parse_times(times), parse_stops(nd))
     _notes(bracket.notes)
     curve = None if response is None else read_response(response)
     exposures = bracket.exposures
     if curve is not None:
         names = [path.name for path in bracket.paths]
         exposures, _ = exposures_for(curve, exposures, names)
-    check_output(output)
+    check_output(output, bracket.inputs)
     with Stage(
         "hdr align",
         inputs=[*bracket.inputs, *([] if response is None else [response])],
         times=times,
+        nd=nd,
         model=model,
     ) as stage:
         frames = [picture.pixels for picture in pictures(bracket, _tell)]
@@ -189,7 +192,7 @@ def response(
     stored = read_response(reuse) if reuse is not None and reuse.is_file() else None
     if reuse is not None and stored is None:
         _tell(f"{reuse}: no stored response; solving one")
-    check_output(output)
+    check_output(output, bracket.inputs)
     with Stage(
         "hdr response",
         inputs=[*bracket.inputs, *([reuse] if reuse is not None and stored else [])],
@@ -327,7 +330,7 @@ def merge(
 
     if output.suffix.lower() != ".exr":
         raise UserError("a radiance map is written as .exr", file=output)
-    if not (memory >= 0):
+    if not 0 <= memory < 1e6:
         raise UserError(f"--memory {memory:g}: give gigabytes, 0 or more")
     reading = _reading(luminance, grey_card, at, scale_from)
     bracket = read_bracket(inputs, parse_times(times), parse_stops(nd), exact=exact_times)
@@ -348,14 +351,15 @@ def merge(
     if bracket.raw and white is not None:
         raise UserError("RAW pictures say what is white: leave --white out")
     curve = None if response is None else read_response(response)
-    known_scale = None if scale_from is None else _scale_of(scale_from, bracket.scale)
     exposures, refined = bracket.exposures, 0
     if curve is not None:
         names = [path.name for path in bracket.paths]
         exposures, refined = exposures_for(curve, bracket.exposures, names)
         if curve.refined:
             _tell(f"refined exposures from {response} for {refined} of {len(exposures)}")
-    check_output(output)
+    check_output(output, bracket.inputs)
+    if curve is not None:
+        _same_camera(curve, bracket)
 
     def check(picture: Picture) -> None:
         if picture.linear and curve is not None:
@@ -420,6 +424,12 @@ def merge(
             whole, found = deghosted(frames, exposures, prepared, curve, white)
             stage.figures |= found
         names = [path.name for path in bracket.paths]
+        scatter = prepared.figures.get("noise_over_response")
+        if scatter is not None and scatter > 3:
+            _tell(
+                f"the pictures scatter {scatter:.1f} times more about this response than those "
+                "it was solved from: is it of this camera, and did nothing move?"
+            )
         suspicions = suspicious(
             frames, exposures, curve, sensor.info if sensor else None, white
         )
@@ -444,10 +454,13 @@ def merge(
         }
         if len(cameras) == 1:
             attributes["cameraModel"] = cameras.pop()
-        if whole is not None and whole.negative.any():
-            attributes[NEGATIVE_MEANING] = "noise, and colours outside Rec.709"
+        if curve is None:
+            attributes[NEGATIVE_MEANING] = "noise about black, and colours outside Rec.709"
         if "white_balance" in stage.figures:
             attributes["whiteBalance"] = stage.figures["white_balance"]
+        unit = _unit(curve, bracket)
+        attributes["radianceUnit"] = unit
+        known_scale = None if scale_from is None else _scale_of(scale_from, bracket.scale, unit)
         factor = known_scale or 1.0
         if reading is not None:
             place, cd = reading
@@ -487,7 +500,7 @@ def merge(
             "preview": _beside(output, "preview").name,
             "histogram": _beside(output, "histogram").name,
         }
-    unit = "" if "luminance_scale" not in stage.figures else ", values in cd/m^2"
+    absolute = ", values in cd/m^2" if "luminance_scale" in stage.figures else ""
     _report(
         output,
         as_json,
@@ -495,9 +508,13 @@ def merge(
             f"{figures['dynamic_range_stops']:.1f} stops",
             f"clipped high {_each(figures['clipped_high'])}, "
             f"low {_each(figures['clipped_low'])}",
-            f"noise from {prepared.figures['noise_from']}, "
-            f"chi-square {_each(prepared.figures['chi_square'], '.2f')}",
-            f"exposure scale {bracket.scale}{unit}",
+            f"noise from {prepared.figures['noise_from']}"
+            + (
+                f", chi-square {_each(prepared.figures['chi_square'], '.2f')}"
+                if len(used) > 1
+                else ""
+            ),
+            f"exposure scale {bracket.scale}{absolute}",
             *(
                 [f"{stage.figures['ghost_regions']} ghosts, {stage.figures['ghost_share']:.2%}"]
                 if deghost
@@ -526,6 +543,8 @@ def _balance(text: str | None) -> Any:
         raise UserError(
             f"--white-balance {text}: camera, daylight, none or three multipliers r,g,b"
         ) from error
+    if not all(0 < value < 1e3 for value in (r, g, b)):
+        raise UserError(f"--white-balance {text}: three positive multipliers")
     return r, g, b
 
 
@@ -557,7 +576,31 @@ def _reading(
     return place, grey_card(*card)
 
 
-def _scale_of(path: Path, scale: str) -> float:
+def _same_camera(curve: Any, bracket: Any) -> None:
+    """Say that the response is of another camera than the pictures, where both are known."""
+    known = curve.record.get("cameras") or []
+    cameras = sorted({frame.camera for frame in bracket.frames if frame.camera})
+    if known and cameras and known != cameras:
+        _tell(
+            f"the response is of {', '.join(map(str, known))}, the pictures are of "
+            f"{', '.join(cameras)}: their curves differ"
+        )
+
+
+def _unit(curve: Any, bracket: Any) -> str:
+    """What value 1 stands for before a light meter says: maps of one unit share a scale."""
+    import hashlib
+
+    camera = ", ".join(sorted({frame.camera for frame in bracket.frames if frame.camera}))
+    if curve is None:
+        kind = "share of the sensor's white" if bracket.raw else "linear value"
+    else:
+        digest = hashlib.blake2b(curve.log_exposure.tobytes(), digest_size=8).hexdigest()
+        kind = f"middle code of response {digest}"
+    return f"{kind}, {camera}" if camera else kind
+
+
+def _scale_of(path: Path, scale: str, unit: str) -> float:
     """The factor to cd/m^2 of a map of the same session."""
     from chromeball.scene.image import read_header
 
@@ -569,6 +612,12 @@ def _scale_of(path: Path, scale: str) -> float:
         raise UserError(
             f"its exposures are {attributes.get('exposureScale')}, those of the pictures "
             f"{scale}: one scale cannot serve both",
+            file=path,
+        )
+    if attributes.get("radianceUnit") != unit:
+        raise UserError(
+            f"its values were in units of {attributes.get('radianceUnit')}, those of the "
+            f"pictures are of {unit}: one scale serves one camera and one response",
             file=path,
         )
     return factor

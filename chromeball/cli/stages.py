@@ -399,6 +399,11 @@ class _Planner:
         if bracket.handheld:
             inputs.append(self._motion(bracket))
             options += ["--motion", self._motion(bracket)]
+        if bracket.moving and self._is_raw(bracket):
+            raise UserError(
+                f"bracket {bracket.name!r} is moving, and its frames are RAW: ghosts are found "
+                "in pictures with their colours"
+            )
         if bracket.moving:
             options.append("--deghost")
         hdr = self.scene.hdr

@@ -11,6 +11,7 @@ import math
 import os
 import re
 import tomllib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_type_hints
 
@@ -358,10 +359,17 @@ def _check_names(scene: Scene) -> None:
     for bracket in scene.bracket:
         for time in bracket.times:
             parse_time(time)
-    _check_hdr(scene.hdr)
+    _check_hdr(scene.hdr, scene.bracket)
 
 
-def _check_hdr(hdr: Hdr) -> None:
+def _check_hdr(hdr: Hdr, brackets: Sequence[Bracket]) -> None:
+    for bracket in brackets:
+        if not all(0 <= stops <= 60 for stops in bracket.nd):
+            raise UserError(f"bracket {bracket.name!r}: nd is 0 to 60 stops, 3 for an ND8")
+    named = hdr.white_balance in (None, "camera", "daylight", "none")
+    number = r"\s*\d*\.?\d+\s*"
+    if not named and not re.fullmatch(",".join([number] * 3), hdr.white_balance or ""):
+        raise UserError('hdr.white_balance is camera, daylight, none or "r,g,b"')
     if hdr.smoothness is not None and hdr.method != "debevec":
         raise UserError('hdr.smoothness is lambda of method = "debevec": leave it out')
     meter = hdr.meter

@@ -70,16 +70,21 @@ def atomic_output(path: str | os.PathLike[str]) -> Generator[Path]:
         os.close(handle)
 
 
-def check_output(path: str | os.PathLike[str]) -> None:
+def check_output(
+    path: str | os.PathLike[str], inputs: Iterable[str | os.PathLike[str]] = ()
+) -> None:
     """Refuse an output that cannot be written, before the work for it is done.
 
     Raises
     ------
     UserError
-        If `path` is a folder, or its own folder cannot be made or written.
+        If `path` is a folder or one of the `inputs`, or its own folder cannot be made or
+        written.
 
     """
     final = Path(path)
+    if final.exists() and any(os.path.samefile(final, i) for i in inputs if Path(i).exists()):
+        raise UserError("is an input, too; name another output", file=final)
     if final.is_dir():
         raise UserError("is a folder; name a file", file=final)
     try:
