@@ -32,7 +32,7 @@ def test_brackets_with_other_settings_share_a_scale(tmp_path: Path) -> None:
     assert bracket.scale == "time * ISO/100 / N^2"
     np.testing.assert_allclose(bracket.exposures, [1 / 8 / 16, 1 / 8 / 16], rtol=1e-4)
     filtered = read_bracket([a, b], nd=[0.0, 3.0])
-    assert filtered.scale == "time * ISO/100 / N^2 * ND"
+    assert filtered.scale == "time * ISO/100 / N^2"
     np.testing.assert_allclose(filtered.exposures, [1 / 128, 1 / 1024], rtol=1e-4)
     timed = read_bracket([a, b], [1.0, 2.0], [1.0])
     np.testing.assert_allclose(timed.exposures, [1 / 32, 1 / 16], rtol=1e-4)

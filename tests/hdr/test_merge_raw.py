@@ -11,7 +11,7 @@ import pytest
 from chromeball.bench.dng import Sensor, write_bracket
 from chromeball.cli.main import build_app
 from chromeball.scene.errors import UserError
-from chromeball.scene.image import read_image, read_rgb
+from chromeball.scene.image import read_image, read_rgb, write_exr
 from tests.hdr.camera import scene
 
 TIMES = [1 / 64, 1 / 8, 1.0]
@@ -144,3 +144,46 @@ def test_brackets_of_measured_sensors(tmp_path: Path, which: int) -> None:
     assert found_b == pytest.approx(b + rounding, rel=0.5, abs=0.03 * a)
     assert figures["chi_square"][0] == pytest.approx(1, abs=0.06)
     assert figures["white_from"] == "metadata" or figures["white"][0][0] == pytest.approx(15000)
+
+
+def test_a_scale_serves_one_camera(bracket: list[Path], tmp_path: Path) -> None:
+    metered = tmp_path / "metered.exr"
+    run("hdr", "merge", *bracket, "--luminance", 250, "--at", "80,60,10,8", "-o", metered)
+    run("hdr", "merge", *bracket, "--nd", 2, "--scale-from", metered, "-o", tmp_path / "n.exr")
+    linear = [tmp_path / f"{j}.exr" for j in range(2)]
+    for j, path in enumerate(linear):
+        write_exr(path, np.minimum(scene(24, 32) * 2**j, 1))
+    words = ("hdr", "merge", *linear, "--times", "1,2", "--scale-from", metered)
+    with pytest.raises(UserError, match="one scale"):
+        run(*words, "-o", tmp_path / "x.exr")
+
+
+def test_inputs_are_not_overwritten(tmp_path: Path) -> None:
+    linear = [tmp_path / f"{j}.exr" for j in range(2)]
+    for j, path in enumerate(linear):
+        write_exr(path, np.minimum(scene(24, 32) * 2**j, 1))
+    before = linear[0].read_bytes()
+    with pytest.raises(UserError, match="is an input"):
+        run("hdr", "merge", *linear, "--times", "1,2", "-o", linear[0])
+    assert linear[0].read_bytes() == before
+
+
+def test_a_hot_pixel_is_not_white(tmp_path: Path) -> None:
+    """Frames that clip at 1 and hold one value of 50; and noise below black."""
+    radiance = scene(48, 64) * 6
+    paths = [tmp_path / f"{j}.exr" for j in range(3)]
+    for path, t in zip(paths, (0.125, 0.5, 2.0), strict=True):
+        frame = np.minimum(radiance * t, 1)
+        frame[0, 0] = -1e-4
+        if t == 2:
+            frame[20, 20] = 50
+        write_exr(path, frame)
+    out = tmp_path / "m.exr"
+    run("hdr", "merge", *paths, "--times", "0.125,0.5,2", "-o", out)
+    assert json.loads((tmp_path / "m.exr.record.json").read_text())["figures"]["white"] == 1
+    image = read_image(out)
+    measured = image.pixels[..., 3] == 0
+    measured[0, 0] = measured[20, 20] = False
+    off = np.abs(image.pixels[..., :3] / radiance - 1)[measured]
+    assert off.max() < 1e-4
+    assert read_rgb(out)[0, 0].min() == 0
