@@ -39,7 +39,7 @@ DARKEST, BRIGHTEST = 4, 250
 #: smallest region, as share of the picture and in pixels
 LEAST_SHARE, LEAST_AREA = 2e-5, 25
 #: share of a region that the common exposure must show for it to be taken
-SHOWN = 0.95
+SHOWN = 0.9
 #: measured over modelled variance is held between these: more is motion all over the picture
 LEAST_FACTOR, MOST_FACTOR = 0.1, 100.0
 
@@ -63,7 +63,8 @@ class Ghosts:
     """What moved.
 
     ``labels`` (H, W) int32: 0, or one more than the index in ``regions``. ``reference``: the
-    frame that is best exposed over the whole picture. ``score`` (H, W) uint8: 8 times the
+    frame that regions are taken from where it shows them: the one that shows most of them,
+    or the best exposed one where nothing moved. ``score`` (H, W) uint8: 8 times the
     deviation in standard deviations, 255 at most. ``inflation`` (P, C): median factor by which
     the variances had to be raised.
     """
@@ -133,17 +134,32 @@ def find_ghosts(
     ranges = np.ascontiguousarray(np.broadcast_to(limits, (len(frames), channels, 2)))
     score = kernel.ghost_scores(tones, np.ascontiguousarray(table), ranges, masks, misaligned)
     labels, boxes = _regions(score)
-    shown = [_shows(tone, limit, masks[j] if masks else None) for j, tone in enumerate(tones)]
-    # a pixel read to 10 % counts a half
-    worth = 1 / (1 + 100 * variance * factor)
-    overall = [_worth(tone, worth[j], shown[j]) for j, tone in enumerate(tones)]
-    chosen = int(np.argmax(overall)) if reference is None else reference
+    counts = np.zeros((len(boxes), len(tones)), np.int64)
+    for k, (x, y, w, h, _) in enumerate(boxes):
+        box = np.s_[y : y + h, x : x + w]
+        inside = labels[box] == k + 1
+        for j, tone in enumerate(tones):
+            shown = _shows(tone[box], limit, masks[j][box] if masks else None)
+            counts[k, j] = np.count_nonzero(shown & inside)
+    if reference is not None:
+        chosen = reference
+    elif boxes:  # what moves in several regions is then shown at one moment
+        chosen = int(np.argmax(counts.sum(axis=0)))
+    else:
+        # a pixel read to 10 % counts a half
+        worth = 1 / (1 + 100 * variance * factor)
+        step = max(1, int(np.sqrt(score.size / 100_000)))
+        lattice = [tone[::step, ::step] for tone in tones]
+        known = [mask[::step, ::step] for mask in masks] or [None] * len(tones)
+        overall = [
+            float((_worth(tone, worth[j]) * _shows(tone, limit, known[j])).mean())
+            for j, tone in enumerate(lattice)
+        ]
+        chosen = int(np.argmax(overall))
     regions: list[Region] = []
-    for number, (x, y, w, h, area) in enumerate(boxes):
-        inside = labels[y : y + h, x : x + w] == number + 1
-        counts = np.array([np.count_nonzero(s[y : y + h, x : x + w] & inside) for s in shown])
-        best = chosen if counts[chosen] >= SHOWN * area else int(np.argmax(counts))
-        regions.append(Region((x, y, w, h), area, best, int(area - counts[best])))
+    for (x, y, w, h, area), count in zip(boxes, counts, strict=True):
+        best = chosen if count[chosen] >= SHOWN * area else int(np.argmax(count))
+        regions.append(Region((x, y, w, h), area, best, int(area - count[best])))
     return Ghosts(labels, tuple(regions), chosen, score, np.median(factor, axis=2))
 
 
@@ -271,12 +287,9 @@ def _shows(
     return shown if valid is None else shown & valid
 
 
-def _worth(tone: NDArray[np.uint8], worth: Float, shown: Mask) -> float:
-    """Mean over a lattice of what pixels are worth (C, 256), where they show anything."""
-    step = max(1, int(np.sqrt(shown.size / 100_000)))
-    lattice = tone[::step, ::step]
-    values = worth[np.arange(tone.shape[2]), lattice].mean(axis=2)
-    return float((values * shown[::step, ::step]).mean())
+def _worth(tone: NDArray[np.uint8], worth: Float) -> Float:
+    """What each pixel (H, W, C) is worth, by a table (C, 256); mean of the channels."""
+    return worth[np.arange(tone.shape[2]), tone].mean(axis=2)
 
 
 def _inflation(

@@ -157,7 +157,8 @@ def test_what_moves_is_found_and_replaced(factor: float) -> None:
         shown = marks[inside] == 0
         assert shown.mean() > 0.9
         error = np.log(better[inside][shown] / truth[shown])
-        assert np.sqrt(np.mean(error**2)) < 0.15
+        assert abs(np.median(error)) < 0.02
+        assert np.sqrt(np.mean(error**2)) < 0.2  # one exposure's noise, dark codes too
         x, y, w, h = region.box
         rows, columns = np.nonzero(inside)
         assert (x, y, x + w, y + h) == (
@@ -179,7 +180,7 @@ def test_one_exposure_is_preferred() -> None:
     shown = ((frames[1] >= 4) & (frames[1] <= 250)).all(axis=2)
     for number, region in enumerate(found.regions):
         # another exposure only where this one is clipped
-        assert region.frame == 1 or shown[found.labels == number + 1].mean() < 0.95
+        assert region.frame == 1 or shown[found.labels == number + 1].mean() < 0.9
 
 
 def test_clipped_where_the_exposure_is() -> None:
