@@ -150,7 +150,9 @@ def find_ghosts(
         worth = 1 / (1 + 100 * variance * factor)
         step = max(1, int(np.sqrt(score.size / 100_000)))
         lattice = [tone[::step, ::step] for tone in tones]
-        known = [mask[::step, ::step] for mask in masks] or [None] * len(tones)
+        known: list[Mask | None] = [None] * len(tones)
+        if masks:
+            known = [mask[::step, ::step] for mask in masks]
         overall = [
             float((_worth(tone, worth[j]) * _shows(tone, limit, known[j])).mean())
             for j, tone in enumerate(lattice)
