@@ -19,6 +19,9 @@ more exact than summing squares over pixels:
 - the prior (:mod:`chromeball.hdr.prior`) settles what a bracket cannot: exact EV steps leave a
   periodic part undamped. How rough the curve may be is chosen by the evidence.
 
+At last each channel is told what the others say (:func:`share`): one that sees little light
+takes the rest of its curve from them.
+
 Rows are weighted by the inverse of: sampling variance of a median, rest of quantisation, and a
 floor; the posterior's covariance is what the standard errors are.
 """
@@ -26,7 +29,7 @@ floor; the posterior's covariance is what the standard errors are.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,6 +55,8 @@ DEPENDENCE = 2.0
 WIDEST = np.log(2) * 3.2
 #: darkness scatters by less than this many knots
 PEDESTAL_SPREAD = 6.0
+#: how much the curves of one camera's channels differ, in ln units, and over how many knots
+ALIKE, ALIKE_REACH = 0.05, 40.0
 #: knots of the piecewise linear code noise
 NOISE_KNOTS = np.array([0.0, 8, 20, 40, 70, 110, 150, 190, 225, 255])
 
@@ -279,7 +284,8 @@ class Fit:
     ``g`` (C, 256) curves and ``covariance`` (C, 256, 256) at the given exposures; with shifts
     d (P,) of log exposures the curves are ``g + moved @ d``, ``moved`` (C, 256, P), and d has
     information S (P, P) with right side b (P,): S d = b, the curves eliminated. ``model``
-    (C,): index of the prior's roughness. ``equations``: of each channel.
+    (C,): index of the prior's roughness. ``equations``: of each channel; ``information`` (C,
+    256, 256) and ``right`` (C, 256, k): their normal equations.
     """
 
     g: Float
@@ -289,6 +295,8 @@ class Fit:
     b: Float
     model: NDArray[np.intp]
     equations: tuple[Equations, ...]
+    information: Float
+    right: Float
 
     def residuals(self, g: Float, mean: Float, d: Float) -> list[Float]:
         """Residuals in ln units of each channel's rows, for curves g and shifts d."""
@@ -345,6 +353,38 @@ def fit(
         b=(t0 - np.einsum("cnp,cn->cp", gt, QX[..., 0])).sum(axis=0),
         model=model,
         equations=tuple(system),
+        information=H,
+        right=X,
+    )
+
+
+def share(fit: Fit, mean: Float, factors: Float) -> Fit:
+    """The fit with each channel told what the others say of it.
+
+    The channels of one camera have nearly one curve: they differ by K, 5 % that vary over 40
+    codes. What channel o adds to another is its likelihood, the posterior less the prior:
+    (Q_o + K)^-1 - (S_o + K)^-1. Where a channel sees no light, the others' curves hold.
+    """
+    place = np.arange(KNOTS)
+    K = ALIKE**2 * np.exp(-0.5 * ((place[:, None] - place) / ALIKE_REACH) ** 2)
+    K += 1e-8 * np.eye(KNOTS)
+    H, X = fit.information.copy(), fit.right.copy()
+    for o, (g, cov, model) in enumerate(zip(fit.g, fit.covariance, fit.model, strict=True)):
+        after = np.linalg.inv(cov + K)
+        before = np.linalg.inv(factors[model] @ factors[model].T + K)
+        said = after @ (g - mean)
+        for c in range(len(H)):
+            if c != o:
+                H[c] += after - before
+                X[c, :, 0] += said
+    QX, Q, _ = posterior(H, X, factors)
+    at = np.arange(len(H))
+    return replace(
+        fit,
+        g=mean + QX[at, fit.model][..., 0],
+        covariance=Q[at, fit.model],
+        information=H,
+        right=X,
     )
 
 

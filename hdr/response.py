@@ -205,6 +205,8 @@ def _comparagram(
         for far in np.flatnonzero(np.abs(shift) > WRONG).tolist():
             wrong[far] = wrong.get(far, 0.0) + float(shift[far])
         fit = comparagram.fit(channels, pairs, log_exposures, mean, factors)
+    if len(channels) > 1:
+        fit = comparagram.share(fit, mean, factors)
     g = np.stack(
         [
             darkened(c, rows.darkness, rows.pedestal)

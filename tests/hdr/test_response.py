@@ -363,6 +363,19 @@ def test_two_frames_suffice(frames: list[NDArray[np.uint8]], plain: Solution) ->
     assert np.quantile(np.abs(found.g - plain.g)[both], 0.95) < 0.01
 
 
+def test_a_channel_without_light_follows_the_others() -> None:
+    """Blue reaches code 70 at most: above it, the curve is that of red and green."""
+    picture = scene()
+    picture[..., 2] *= 0.008
+    found = solved(photograph(picture))
+    assert np.all(found.observed[2, 90:] == 0)
+    difference = found.g - log_exposure()
+    assert np.sqrt(np.mean(difference[2, 40:250] ** 2)) < 0.01
+    assert np.sqrt(np.mean(difference[:2, 24:250] ** 2)) < 0.004
+    # it is told apart from what was measured
+    assert np.median(found.sigma[2, 120:240]) > 2 * np.median(found.sigma[1, 120:240])
+
+
 def test_several_scenes_are_not_compared_with_each_other() -> None:
     a, b = photograph(scene(seed=3)), photograph(scene(seed=4))
     samples = [sample(f, scene=0) for f in a] + [sample(f, scene=1) for f in b]
@@ -411,7 +424,7 @@ def test_nominal_times_are_refined_where_the_pictures_say_so() -> None:
     assert found.refined
     assert not kept.refined
     assert found.rms.max() < 0.5 * kept.rms.max()
-    np.testing.assert_allclose(found.rms_nominal, kept.rms)
+    np.testing.assert_allclose(found.rms_nominal, kept.rms, rtol=0.1)
     # up to the span and the mean, which cannot be known
     slope, offset = np.polyfit(found.log_exposures, np.log(TIMES), 1)
     rest = slope * found.log_exposures + offset - np.log(TIMES)
