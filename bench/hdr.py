@@ -2,11 +2,12 @@
 
 DoRF curves (Grossberg and Nayar 2003) photograph real radiance maps: full well 15000 e-, read
 noise 5 e-, 8 bits. `hdr_response` judges curves, `hdr_left_out` predicts exposures of real
-brackets, `hdr_merge` judges radiance.
+brackets, `hdr_merge` judges radiance, `hdr_align` alignment and ghosts.
 """
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import subprocess
@@ -34,6 +35,8 @@ MAPS = (
 type Float = NDArray[np.float64]
 type Frames = list[NDArray[np.uint8]]
 
+#: what is measured, each in a process of its own
+MODULES = ("hdr_response", "hdr_left_out", "hdr_merge", "hdr_align")
 #: exposures of the three brackets
 BRACKETS: dict[str, Float] = {
     "5 x 2 EV": np.exp2(np.arange(-4.0, 5.0, 2.0)),
@@ -55,17 +58,12 @@ def rows(quick: bool = False) -> list[Row]:
     if not (DATA / "dorf.npz").is_file():
         return []
     found: list[Row] = []
-    for module in ("hdr_response", "hdr_left_out", "hdr_merge"):
-        words = [sys.executable, "-m", f"chromeball.bench.{module}", *(["quick"] * quick)]
+    for module in MODULES:
+        words = [sys.executable, "-m", "chromeball.bench.hdr", module, *(["quick"] * quick)]
         alone = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
         done = subprocess.run(words, stdout=subprocess.PIPE, text=True, check=True, env=alone)
         found += [Row(**fields) for fields in json.loads(done.stdout)]
     return found
-
-
-def tell(found: list[Row]) -> None:
-    """Print rows for the process that asked for them."""
-    print(json.dumps([asdict(row) for row in found]))
 
 
 @cache
@@ -115,3 +113,10 @@ def develop(sensor: list[NDArray[np.uint16]], transfer: tuple[Float, Float]) -> 
 def photograph(radiance: Float, transfer: tuple[Float, Float], times: Float = TIMES) -> Frames:
     """8-bit pictures of a radiance map by the emulated camera."""
     return develop(expose(radiance, times), transfer)
+
+
+if __name__ == "__main__":
+    measured = importlib.import_module(f"chromeball.bench.{sys.argv[1]}").rows(
+        "quick" in sys.argv[2:]
+    )
+    print(json.dumps([asdict(row) for row in measured]))

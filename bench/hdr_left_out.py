@@ -14,7 +14,6 @@ others cannot be inverted.
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -192,7 +191,3 @@ TOOLS = {
     "OpenCV Debevec, 500 samples": Tool(_peer(solvers.opencv_debevec_500), _given),
     "the paper (colour-hdri, 300 samples)": Tool(_peer(solvers.paper), _given),
 }
-
-
-if __name__ == "__main__":
-    room.tell(rows("quick" in sys.argv[1:]))

@@ -253,7 +253,4 @@ def _resident(key: str) -> float:
 
 
 if __name__ == "__main__":
-    if len(sys.argv) == 3:
-        _measure(sys.argv[1], float(sys.argv[2]))
-    else:
-        room.tell(rows("quick" in sys.argv[1:]))
+    _measure(sys.argv[1], float(sys.argv[2]))

@@ -17,7 +17,6 @@ rows name it, and say how far its next relative is.
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -192,7 +191,3 @@ def _row(what: str, tool: str, runs: Runs) -> Row:
         "ln RMS, median",
         "; ".join(notes),
     )
-
-
-if __name__ == "__main__":
-    room.tell(rows("quick" in sys.argv[1:]))
