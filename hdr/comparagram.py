@@ -366,8 +366,8 @@ def share(fit: Fit, mean: Float, factors: Float) -> Fit:
     (Q_o + K)^-1 - (S_o + K)^-1. Where a channel sees no light, the others' curves hold.
     """
     place = np.arange(KNOTS)
-    K = ALIKE**2 * np.exp(-0.5 * ((place[:, None] - place) / ALIKE_REACH) ** 2)
-    K += 1e-8 * np.eye(KNOTS)
+    nearness = np.exp(-0.5 * ((place[:, None] - place) / ALIKE_REACH) ** 2)
+    K = ALIKE**2 * nearness + 1e-8 * np.eye(KNOTS)
     H, X = fit.information.copy(), fit.right.copy()
     for o, (g, cov, model) in enumerate(zip(fit.g, fit.covariance, fit.model, strict=True)):
         after = np.linalg.inv(cov + K)
