@@ -16,6 +16,7 @@ import msgspec
 from msgspec import Meta, Struct
 
 from chromeball.scene.errors import UserError
+from chromeball.scene.record import decode
 
 TAKE = "take.json"
 
@@ -142,12 +143,7 @@ def read_take(path: str | os.PathLike[str]) -> Take:
 def parse_take(data: bytes, path: str | os.PathLike[str] = TAKE) -> Take:
     """As :func:`read_take`, from the bytes; whether the pictures exist is not looked at."""
     file = Path(path)
-    try:
-        content = msgspec.json.decode(data, type=TakeFile)
-    except msgspec.ValidationError as error:
-        raise UserError(str(error).replace("`$.", "`"), file=file) from error
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise UserError(f"not valid JSON: {error}", file=file) from error
+    content = decode(data, TakeFile, file)
     folder = file.absolute().parent
     frames: list[Exposed] = []
     for row in content.frames:

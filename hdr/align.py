@@ -31,6 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chromeball.hdr import kernel
+from chromeball.hdr.frames import KINDS, check_frames
 from chromeball.hdr.match import (
     LEAST_TILES,
     MODELS,
@@ -50,7 +51,6 @@ from chromeball.hdr.match import (
 )
 from chromeball.scene.errors import UserError
 
-KINDS = ("uint8", "uint16", "float32")
 #: pixels of the finest level that is compared; larger frames are averaged down to it
 FINEST = 1_000_000
 #: error (pixels of the finest level) that interpolation leaves: the largest of known shifts
@@ -463,25 +463,9 @@ def _refuse(
     reference: int | None,
     models: Sequence[str],
 ) -> None:
-    if len(frames) == 0:
-        raise UserError("no pictures to align")
-    if len(frames) != len(exposures):
-        raise UserError(f"{len(exposures)} exposures for {len(frames)} pictures")
-    if not (np.all(np.isfinite(exposures)) and np.all(exposures > 0)):
-        raise UserError("exposures must be positive numbers")
-    first = frames[0]
-    if first.ndim != 3 or any(f.shape != first.shape or f.dtype != first.dtype for f in frames):
-        raise UserError("the pictures of a bracket have one size, (H, W, C), and one type")
-    if str(first.dtype) not in KINDS:
-        raise UserError(f"pictures of {first.dtype} values: 8-bit, 16-bit or float are needed")
-    if min(first.shape[:2]) < 32:
+    check_frames(frames, exposures, log_exposure)
+    if min(frames[0].shape[:2]) < 32:
         raise UserError("pictures under 32 pixels a side are too small to be aligned")
-    if log_exposure is not None:
-        codes = log_exposure.shape[1]
-        if first.dtype == np.float32 or (first.dtype == np.uint8 and codes != 256):
-            raise UserError(f"a response of {codes} codes is not for pictures of {first.dtype}")
-        if log_exposure.shape[0] != first.shape[2]:
-            raise UserError("the response does not have the pictures' channels")
     if reference is not None and not 0 <= reference < len(frames):
         raise UserError(f"there is no frame {reference} to be the reference")
     if not models or any(m not in MODELS for m in models):

@@ -178,7 +178,7 @@ def _smooth(values: Float, width: int) -> Float:
 
 
 def slope_of(g: Float) -> Float:
-    """G' of a curve (256,), smoothed and positive."""
+    """The slope g' of a curve (256,), smoothed and positive."""
     return np.maximum(np.gradient(_smooth(g, 5)), 1e-4)
 
 
@@ -281,16 +281,14 @@ def misfit_of(e: Equations, residual: Float) -> Float:
 class Fit:
     """What the rows of all channels say.
 
-    ``g`` (C, 256) curves and ``covariance`` (C, 256, 256) at the given exposures; with shifts
-    d (P,) of log exposures the curves are ``g + moved @ d``, ``moved`` (C, 256, P), and d has
-    information S (P, P) with right side b (P,): S d = b, the curves eliminated. ``model``
-    (C,): index of the prior's roughness. ``equations``: of each channel; ``information`` (C,
-    256, 256) and ``right`` (C, 256, k): their normal equations.
+    ``g`` (C, 256) curves and ``covariance`` (C, 256, 256) at the given exposures; shifts d (P,)
+    of log exposures have information S (P, P) with right side b (P,): S d = b, the curves
+    eliminated. ``model`` (C,): index of the prior's roughness. ``equations``: of each channel;
+    ``information`` (C, 256, 256) and ``right`` (C, 256, k): their normal equations.
     """
 
     g: Float
     covariance: Float
-    moved: Float
     S: Float
     b: Float
     model: NDArray[np.intp]
@@ -298,11 +296,10 @@ class Fit:
     information: Float
     right: Float
 
-    def residuals(self, g: Float, mean: Float, d: Float) -> list[Float]:
-        """Residuals in ln units of each channel's rows, for curves g and shifts d."""
+    def residuals(self, mean: Float) -> list[Float]:
+        """Residuals in ln units of each channel's rows."""
         return [
-            e.y - e.D @ (curve - mean) + e.E @ d
-            for e, curve in zip(self.equations, g, strict=True)
+            e.y - e.D @ (curve - mean) for e, curve in zip(self.equations, self.g, strict=True)
         ]
 
     def gain(self, free: Float) -> tuple[float, Float]:
@@ -332,11 +329,11 @@ def fit(
             np.stack(part) for part in zip(*(_normal(e) for e in system), strict=True)
         )
         # the first pass is for the slopes and the misfit alone
-        all_moved, all_Q, logdet = posterior(H, X, factors if final else factors[:1])
-        gain = 0.5 * np.einsum("cn,cmn->cm", X[..., 0], all_moved[..., 0]) - 0.5 * logdet
+        all_QX, all_Q, logdet = posterior(H, X, factors if final else factors[:1])
+        gain = 0.5 * np.einsum("cn,cmn->cm", X[..., 0], all_QX[..., 0]) - 0.5 * logdet
         model = np.argmax(gain, axis=1)
         at = np.arange(len(channels))
-        QX, Q = all_moved[at, model], all_Q[at, model]
+        QX, Q = all_QX[at, model], all_Q[at, model]
         curves = mean + QX[..., 0]
         if not final:
             misfit = [
@@ -348,7 +345,6 @@ def fit(
     return Fit(
         g=curves,
         covariance=Q,
-        moved=-Qgt,
         S=(tt - np.swapaxes(gt, 1, 2) @ Qgt).sum(axis=0),
         b=(t0 - np.einsum("cnp,cn->cp", gt, QX[..., 0])).sum(axis=0),
         model=model,

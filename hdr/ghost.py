@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chromeball.hdr import kernel
+from chromeball.hdr.frames import check_frames
 from chromeball.scene.errors import UserError
 
 type Float = NDArray[np.float64]
@@ -415,26 +416,14 @@ def _refuse(
 ) -> None:
     if len(frames) < 2:
         raise UserError("ghosts need two pictures or more")
-    if len(frames) != len(exposures):
-        raise UserError(f"{len(exposures)} exposures for {len(frames)} pictures")
-    if not (np.all(np.isfinite(exposures)) and np.all(exposures > 0)):
-        raise UserError("exposures must be positive numbers")
-    first = frames[0]
-    if first.ndim != 3 or any(f.shape != first.shape or f.dtype != first.dtype for f in frames):
-        raise UserError("the pictures of a bracket have one size, (H, W, C), and one type")
-    if str(first.dtype) not in ("uint8", "uint16", "float32"):
-        raise UserError(f"pictures of {first.dtype} values: 8-bit, 16-bit or float are needed")
+    check_frames(frames, exposures, log_exposure)
     if log_exposure is None:
-        if first.dtype == np.uint8:
+        if frames[0].dtype == np.uint8:
             raise UserError("8-bit pictures need a response: make it with `hdr response`")
-    else:
-        codes = log_exposure.shape[1]
-        if first.dtype == np.float32 or (first.dtype == np.uint8 and codes != CODES):
-            raise UserError(f"a response of {codes} codes is not for pictures of {first.dtype}")
-        if log_exposure.shape[0] != first.shape[2]:
-            raise UserError("the response does not have the pictures' channels")
-        if max(int(f.max()) for f in frames) >= codes:
-            raise UserError(f"the pictures hold codes beyond the {codes} of the response")
+    elif max(int(f.max()) for f in frames) >= log_exposure.shape[1]:
+        raise UserError(
+            f"the pictures hold codes beyond the {log_exposure.shape[1]} of the response"
+        )
     if not (np.all(np.isfinite(code_noise)) and np.all(code_noise >= 0)):
         raise UserError("the noise of a code is a positive number")
     if not (np.isfinite(misaligned) and misaligned >= 0):

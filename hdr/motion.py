@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from chromeball.hdr.align import Alignment, is_needed
 from chromeball.scene.errors import UserError
+from chromeball.scene.record import decode
 
 type Float = NDArray[np.float64]
 type Row = Annotated[list[float], Meta(min_length=3, max_length=3)]
@@ -127,12 +128,7 @@ def read_motion(path: str | os.PathLike[str]) -> Motion:
 
 def parse_motion(data: bytes, path: str | os.PathLike[str] = "motion.json") -> Motion:
     """As :func:`read_motion`, from the bytes."""
-    try:
-        content = msgspec.json.decode(data, type=_File)
-    except msgspec.ValidationError as error:
-        raise UserError(str(error).replace("`$.", "`"), file=path) from error
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise UserError(f"not valid JSON: {error}", file=path) from error
+    content = decode(data, _File, path)
     if content.version != 1:
         raise UserError(f"version {content.version}: this program reads version 1", file=path)
     transforms = np.array([frame.transform for frame in content.frames], np.float64)

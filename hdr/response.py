@@ -181,7 +181,7 @@ def _comparagram(
     mean, factors = prior.at(codes)
     P = len(log_exposures)
     fit = comparagram.fit(channels, pairs, log_exposures, mean, factors)
-    given = fit.residuals(fit.g, mean, np.zeros(P))
+    given = fit.residuals(mean)
 
     wrong: dict[int, float] = {}
     while P >= 3 and len(wrong) < P // 3:
@@ -216,7 +216,7 @@ def _comparagram(
     rise = g[:, 240] - g[:, 16]
     if np.any(rise <= 0):
         _refuse_falling()
-    residuals = fit.residuals(fit.g, mean, np.zeros(P))
+    residuals = fit.residuals(mean)
     middle = fit.covariance[:, MIDDLE, MIDDLE, None]
     variance = (
         np.diagonal(fit.covariance, axis1=1, axis2=2) + middle - 2 * fit.covariance[:, MIDDLE]

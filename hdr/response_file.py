@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from chromeball.hdr.knots import DEPTHS
 from chromeball.scene.errors import UserError
-from chromeball.scene.record import to_json
+from chromeball.scene.record import decode, to_json
 
 type Float = NDArray[np.float64]
 
@@ -120,12 +120,7 @@ def read_response(path: str | os.PathLike[str]) -> Response:
 
 def parse_response(data: bytes, path: str | os.PathLike[str] = "response.json") -> Response:
     """As :func:`read_response`, from the bytes."""
-    try:
-        content = msgspec.json.decode(data, type=_File)
-    except msgspec.ValidationError as error:
-        raise UserError(str(error).replace("`$.", "`"), file=path) from error
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise UserError(f"not valid JSON: {error}", file=path) from error
+    content = decode(data, _File, path)
     if content.version != 2:
         raise UserError(
             f"version {content.version}: this program reads version 2; solve it anew",

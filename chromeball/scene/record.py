@@ -26,6 +26,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from chromeball.scene.errors import UserError
@@ -131,6 +132,23 @@ def read_json(path: str | os.PathLike[str]) -> Any:
         raise UserError("no such file", file=path) from error
     except (OSError, UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
         raise UserError(f"not a readable JSON file: {error}", file=path) from error
+
+
+def decode[T](data: bytes, kind: type[T], path: str | os.PathLike[str]) -> T:
+    """The JSON `data` of the file `path` as a msgspec struct.
+
+    Raises
+    ------
+    UserError
+        Not JSON, an unknown or missing key, a value of another kind or out of bounds.
+
+    """
+    try:
+        return msgspec.json.decode(data, type=kind)
+    except msgspec.ValidationError as error:
+        raise UserError(str(error).replace("`$.", "`"), file=path) from error
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise UserError(f"not valid JSON: {error}", file=path) from error
 
 
 def to_json(value: object) -> Json:
