@@ -85,6 +85,8 @@ class Composite:
 class Compositor:
     """A progressive compositor: :meth:`add` samples, look at :meth:`result`, go on.
 
+    :meth:`look` starts over with another camera, :meth:`place` with other objects.
+
     Parameters
     ----------
     objects
@@ -123,21 +125,35 @@ class Compositor:
         samples: int = 64,
         plate_samples: int = 16,
     ) -> None:
-        self._rays = np.ascontiguousarray(rays, np.float32)
-        self._camera = _triple(camera)
         self._difference = mode == "difference"
-        self._core = core.Compositor(
+        self._captured = captured
+        self._environment = np.ascontiguousarray(captured.environment, np.float32)
+        self._options = bounces, seed, samples
+        self._plate_samples = plate_samples
+        self._core = self._build(objects)
+        self.look(rays, camera, plate)
+
+    def _build(self, objects: Sequence[Mesh]) -> core.Compositor:
+        return core.Compositor(
             Mesh.join(objects).core(),
             _bounds(objects),
-            _core_stand_in(captured.stand_in),
-            np.ascontiguousarray(captured.environment, np.float32),
-            _triple(captured.origin),
-            bounces,
-            seed,
-            samples,
+            _core_stand_in(self._captured.stand_in),
+            self._environment,
+            _triple(self._captured.origin),
+            *self._options,
         )
+
+    def look(
+        self,
+        rays: NDArray[np.float32],
+        camera: Values,
+        plate: NDArray[np.float32] | None = None,
+    ) -> None:
+        """Start over with another camera and plate; the world stays as it is built."""
+        self._rays = np.ascontiguousarray(rays, np.float32)
+        self._camera = _triple(camera)
         if plate is None:
-            plate = self._core.background(self._rays, self._camera, plate_samples)
+            plate = self._core.background(self._rays, self._camera, self._plate_samples)
         self.plate = np.ascontiguousarray(plate, np.float32)
         height, width = self._rays.shape[0] - 1, self._rays.shape[1] - 1
         if self.plate.shape != (height, width, 3):
@@ -145,7 +161,15 @@ class Compositor:
         corners = np.isfinite(self._rays).all(axis=2)
         #: pixels inside the lens; the core leaves the others out
         self._seen = corners[1:, 1:] & corners[1:, :-1] & corners[:-1, 1:] & corners[:-1, :-1]
-        self._film = np.zeros((height, width, _COUNT), np.float32)
+        self._start()
+
+    def place(self, objects: Sequence[Mesh]) -> None:
+        """Start over with other objects; camera and plate stay."""
+        self._core = self._build(objects)
+        self._start()
+
+    def _start(self) -> None:
+        self._film = np.zeros((*self.plate.shape[:2], _COUNT), np.float32)
         #: samples a pixel so far (the mean where they differ), rays traced so far
         self.samples, self.rays_traced = 0, 0
 

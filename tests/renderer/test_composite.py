@@ -358,3 +358,20 @@ def test_refining_without_objects_leaves_the_plate() -> None:
     for _ in range(3):
         job.refine(8)
     assert job.result().rgb.tobytes() == plate.tobytes()
+
+
+def test_another_camera_and_other_objects_give_what_a_new_compositor_gives() -> None:
+    near, far = camera((0, 1, 2), (0, 0.3, 0), 0.8), camera((1, 1, 3), (0, 0, 0), 0.6, (20, 10))
+    small = [ball((0, 0.3, 0), 0.3, 0.5, Kind.DIFFUSE)]
+    large = [ball((0.2, 0.5, 0), 0.5, 0.9, Kind.MIRROR)]
+    used = compositor(small, WHITE, floor(), near, seed=3)
+    used.add(4)
+    used.look(corner_rays(far), far.world_from_camera.translation)
+    used.place(large)
+    fresh = compositor(large, WHITE, floor(), far, seed=3)
+    for job in (used, fresh):
+        job.add(8)
+    assert used.samples == fresh.samples == 8
+    assert used.plate.tobytes() == fresh.plate.tobytes()
+    assert used.result().rgb.tobytes() == fresh.result().rgb.tobytes()
+    assert used.result().changed.any()
