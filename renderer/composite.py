@@ -173,10 +173,24 @@ class Compositor:
         #: samples a pixel so far (the mean where they differ), rays traced so far
         self.samples, self.rays_traced = 0, 0
 
-    def add(self, samples: int) -> None:
-        """Add `samples` sub-samples to each pixel."""
-        self._add(np.full(self._film.shape[:2], samples, np.uint16))
+    def add(self, samples: int, rows: NDArray[np.bool_] | None = None) -> None:
+        """Add `samples` sub-samples to each pixel, or to those of the `rows` (H,) alone."""
+        counts = np.full(self._film.shape[:2], samples, np.uint16)
+        if rows is not None:
+            counts[~rows] = 0
+        self._add(counts)
         self.samples += samples
+
+    def film(self) -> NDArray[np.float32]:
+        """What the passes have added up, (H, W, C), a row of sums a pixel; see `restore`."""
+        return self._film.copy()
+
+    def restore(self, film: NDArray[np.float32], samples: int) -> None:
+        """Go on from a :meth:`film`, of which each pixel has `samples`."""
+        if film.shape != self._film.shape:
+            raise ValueError(f"film is {film.shape}, not {self._film.shape}")
+        self._film = np.ascontiguousarray(film, np.float32)
+        self.samples = samples
 
     def refine(self, samples: int) -> None:
         """Add `samples` sub-samples a pixel in the mean, where they lower the noise most.

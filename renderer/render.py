@@ -6,7 +6,7 @@ import math
 import os
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from chromeball.renderer.composite import CapturedSet, Composite, Compositor
 from chromeball.renderer.path import corner_rays
-from chromeball.renderer.scene import object_meshes
-from chromeball.scene.camera import CameraModel
+from chromeball.renderer.scene import object_meshes, turn
+from chromeball.scene.camera import WORLD_FROM_LATLONG, CameraModel
 from chromeball.scene.color import luminance
 from chromeball.scene.errors import UserError
 from chromeball.scene.image import read_image, read_rgb, to_display, write_exr, write_picture
@@ -24,8 +24,11 @@ from chromeball.scene.pose import Pose
 from chromeball.scene.record import Stage, check_output
 from chromeball.stand_in.ply import read_stand_in
 
+#: Told after each pass: samples a pixel and, where it is known, the relative error so far.
+type Progress = Callable[[int, float | None], None]
+
 #: Samples of one progressive pass.
-_PASS = 8
+PASS = 8
 
 
 @dataclass(frozen=True)
@@ -44,12 +47,12 @@ class Budget:
         if self.error is not None and self.spp is None and self.seconds is None:
             object.__setattr__(self, "spp", 65536)  # an end for an error out of reach
 
-    def reached(self, samples: int, seconds: float, error: Callable[[], float]) -> bool:
-        """Whether to stop now; `error` is only asked for where it matters."""
+    def reached(self, samples: int, seconds: float, error: float | None) -> bool:
+        """Whether to stop now; `error` is None where it is not known yet."""
         return (
             (self.spp is not None and samples >= self.spp)
             or (self.seconds is not None and seconds >= self.seconds)
-            or (self.error is not None and samples >= 2 * _PASS and error() <= self.error)
+            or (self.error is not None and error is not None and error <= self.error)
         )
 
 
@@ -59,6 +62,7 @@ class Job:
 
     name: str
     compositor: Compositor
+    captured: CapturedSet
     size: tuple[int, int]
     exposure: float | None
     inputs: tuple[Path, ...]
@@ -105,9 +109,10 @@ def prepare(scene: Scene, folder: Path, view: View, spp: int) -> Job:
     else:
         camera = virtual_camera(view, origin)
     inputs += [folder / o.mesh for o in scene.object if (folder / o.mesh).is_file()]
+    captured = CapturedSet(environment, origin, stand_in)
     compositor = Compositor(
         object_meshes(scene, folder),
-        CapturedSet(environment, origin, stand_in),
+        captured,
         corner_rays(camera),
         camera.world_from_camera.translation,
         plate,
@@ -116,31 +121,27 @@ def prepare(scene: Scene, folder: Path, view: View, spp: int) -> Job:
         seed=scene.render.seed,
         samples=spp,
     )
-    return Job(view.name, compositor, camera.size, view.exposure, tuple(inputs))
+    return Job(view.name, compositor, captured, camera.size, view.exposure, tuple(inputs))
 
 
 def virtual_camera(view: View, origin: NDArray[np.float64]) -> CameraModel:
-    """The camera of a view without a plate: at the map's origin, turned to ``look_at``.
+    """The camera of a view without a plate: at its position or the map's origin, turned.
 
-    A ``latlong`` view keeps the world's axes, as env.exr.
+    A ``latlong`` view that is not turned keeps the world's axes, as env.exr.
     """
-    if view.model == "latlong":
-        camera = CameraModel.latlong(view.size)
-        return camera.posed(Pose(camera.world_from_camera.rotation, origin))
-    target = np.array(view.look_at, float)
-    up = np.array([0.0, 1.0, 0.0])
-    if np.linalg.norm(np.cross(target - origin, up)) < 1e-6:
-        up = np.array([0.0, 0.0, -1.0])  # straight down or up
-    try:
-        pose = Pose.look_at(origin, target, up)
-    except ValueError as error:
-        raise UserError(
-            f"view {view.name!r}: look_at is the place of the light probe; choose another point"
-        ) from error
-    if np.linalg.norm(target - origin) < 1e-4:
-        raise UserError(
-            f"view {view.name!r}: look_at is the place of the light probe; choose another point"
-        )
+    place = origin if view.position is None else np.array(view.position, float)
+    if view.rotation is not None:
+        turned = turn(view.rotation)
+        if view.model == "latlong":
+            return CameraModel.latlong(
+                view.size, Pose(turned @ WORLD_FROM_LATLONG.rotation, place)
+            )
+        # it looks along -z with +y up; camera axes are y down, z forward
+        pose = Pose(turned @ np.diag([1.0, -1.0, -1.0]), place)
+    elif view.model == "latlong":
+        return CameraModel.latlong(view.size, Pose(WORLD_FROM_LATLONG.rotation, place))
+    else:
+        pose = _looking_at(view, place)
     fov = math.radians(view.fov)
     if view.model == "pinhole":
         if fov >= math.radians(179):
@@ -149,85 +150,96 @@ def virtual_camera(view: View, origin: NDArray[np.float64]) -> CameraModel:
     return CameraModel.fisheye(view.model, view.size, fov, pose=pose)
 
 
+def _looking_at(view: View, place: NDArray[np.float64]) -> Pose:
+    target = np.array(view.look_at, float)
+    up = np.array([0.0, 1.0, 0.0])
+    if np.linalg.norm(np.cross(target - place, up)) < 1e-6:
+        up = np.array([0.0, 0.0, -1.0])  # straight down or up
+    try:
+        pose = Pose.look_at(place, target, up)
+    except ValueError as error:
+        raise UserError(_same_place(view)) from error
+    if np.linalg.norm(target - place) < 1e-4:
+        raise UserError(_same_place(view))
+    return pose
+
+
+def _same_place(view: View) -> str:
+    where = "the place of the light probe" if view.position is None else "its position"
+    return f"view {view.name!r}: look_at is {where}; choose another point"
+
+
 def accumulate(
     compositor: Compositor,
     budget: Budget,
-    progress: Callable[[int, float], None] | None = None,
+    progress: Progress | None = None,
 ) -> Composite:
-    """Passes until the budget is reached; `progress` gets samples and seconds so far."""
+    """Passes until the budget is reached; the error is only known where it is asked for."""
     start = time.perf_counter()
     seconds = 0.0
     while True:
-        left = _PASS if budget.spp is None else min(_PASS, budget.spp - compositor.samples)
+        left = PASS if budget.spp is None else min(PASS, budget.spp - compositor.samples)
         if budget.seconds is not None:  # as many as still fit, by the speed so far
             speed = compositor.samples / seconds if seconds > 0 else 0.0
             left = max(1, min(left, int(speed * (budget.seconds - seconds))))
         compositor.refine(left)
         seconds = time.perf_counter() - start
+        error = None
+        if budget.error is not None and compositor.samples >= 2 * PASS:
+            error = compositor.result().relative_error()
         if progress is not None:
-            progress(compositor.samples, seconds)
-        if budget.reached(
-            compositor.samples, seconds, lambda: compositor.result().relative_error()
-        ):
+            progress(compositor.samples, error)
+        if budget.reached(compositor.samples, seconds, error):
             return compositor.result()
 
 
-def render_view(
-    scene: Scene,
-    scene_file: str | os.PathLike[str],
-    view: View,
-    budget: Budget,
-    output: str | os.PathLike[str] | None = None,
-    progress: Callable[[int, float], None] | None = None,
-) -> dict[str, object]:
-    """Render one view into an EXR with its layers and a PNG beside it; its figures.
-
-    The EXR holds R G B A, ``quotient.R G B``, ``objects.R G B`` (premultiplied),
-    ``error.Y`` (standard error of the brightness) and ``depth.Z`` in metres.
-    """
-    folder = Path(scene_file).parent
-    target = Path(output) if output else folder / scene.folder / f"{view.name}.exr"
+def check_target(output: str | os.PathLike[str]) -> Path:
+    """The EXR that a composite is written to, refused early where it or its PNG cannot be."""
+    target = Path(output)
     if target.suffix.lower() != ".exr":
         raise UserError("the composite is an EXR file; name it so", file=target)
     for file in (target, target.with_suffix(".png")):
         check_output(file)
-    if budget == Budget():
-        budget = replace(budget, spp=scene.render.spp)
-    spp = budget.spp if budget.spp is not None and budget.spp < 4096 else 256
-    job = prepare(scene, folder, view, spp)
-    inputs = [Path(scene_file), *job.inputs]
-    with Stage("render", inputs, view=view.name, seed=scene.render.seed) as stage:
-        start = time.perf_counter()
-        composite = accumulate(job.compositor, budget, progress)
-        seconds = time.perf_counter() - start
-        exposure = job.exposure or automatic_exposure(composite.rgb)
-        png = target.with_suffix(".png")
-        changed = composite.changed
-        with np.errstate(divide="ignore", invalid="ignore"):
-            relative = composite.standard_error / composite.rgb.mean(axis=2)
-        relative = relative[changed & np.isfinite(relative)]
-        clipped = (composite.rgb * exposure > 1).any(axis=2)
-        stage.figures |= {
-            "spp": job.compositor.samples,
-            "seconds": seconds,
-            "mrays_per_second": job.compositor.rays_traced / max(seconds, 1e-9) / 1e6,
-            # one sample says nothing of its noise
-            "relative_error": composite.relative_error()
-            if job.compositor.samples > 1
-            else None,
-            "median_standard_error": float(np.median(relative)) if relative.size else 0.0,
-            "changed_pixels": int(changed.sum()),
-            "coverage": float(composite.alpha.mean()),
-            "clipped_negative_pixels": composite.clipped,
-            "clipped_png_pixels": int(clipped.sum()),
-            "exposure": exposure,
-            "png": png.name,
-        }
-        with stage.output(target) as temporary:
-            _write_layers(temporary, composite)
-        with stage.output(png) as temporary:
-            write_picture(temporary, to_display(composite.rgb, exposure))
-    return dict(stage.figures)
+    return target
+
+
+def expected_samples(budget: Budget) -> int:
+    """About how many samples a pixel will get: their order is made for so many."""
+    return budget.spp if budget.spp is not None and budget.spp < 4096 else 256
+
+
+def write_composite(stage: Stage, job: Job, composite: Composite, target: Path) -> None:
+    """Write the EXR with its layers and the PNG as outputs of `stage`, and its figures.
+
+    The EXR holds R G B A, ``quotient.R G B``, ``objects.R G B`` (premultiplied),
+    ``error.Y`` (standard error of the brightness) and ``depth.Z`` in metres.
+    """
+    seconds = stage.elapsed()
+    exposure = job.exposure or automatic_exposure(composite.rgb)
+    png = target.with_suffix(".png")
+    changed = composite.changed
+    with np.errstate(divide="ignore", invalid="ignore"):
+        relative = composite.standard_error / composite.rgb.mean(axis=2)
+    relative = relative[changed & np.isfinite(relative)]
+    clipped = (composite.rgb * exposure > 1).any(axis=2)
+    stage.figures |= {
+        "spp": job.compositor.samples,
+        "seconds": seconds,
+        "mrays_per_second": job.compositor.rays_traced / max(seconds, 1e-9) / 1e6,
+        # one sample says nothing of its noise
+        "relative_error": composite.relative_error() if job.compositor.samples > 1 else None,
+        "median_standard_error": float(np.median(relative)) if relative.size else 0.0,
+        "changed_pixels": int(changed.sum()),
+        "coverage": float(composite.alpha.mean()),
+        "clipped_negative_pixels": composite.clipped,
+        "clipped_png_pixels": int(clipped.sum()),
+        "exposure": exposure,
+        "png": png.name,
+    }
+    with stage.output(target) as temporary:
+        _write_layers(temporary, composite)
+    with stage.output(png) as temporary:
+        write_picture(temporary, to_display(composite.rgb, exposure))
 
 
 def automatic_exposure(rgb: NDArray[np.float32]) -> float:
@@ -241,6 +253,11 @@ def automatic_exposure(rgb: NDArray[np.float32]) -> float:
         return 1.0
     middle, bright = np.percentile(brightness, [50, 90])
     return float(0.25 / math.sqrt(middle * bright))
+
+
+def steady_exposure(job: Job) -> float:
+    """One exposure for all frames of a sequence: :func:`automatic_exposure` of the map."""
+    return automatic_exposure(job.captured.environment)
 
 
 def _origin(env_file: Path) -> NDArray[np.float64]:

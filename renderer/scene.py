@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from chromeball.renderer.mesh import Kind, Mesh
 from chromeball.renderer.primitives import PRIMITIVES, Triangles
 from chromeball.scene.errors import UserError
-from chromeball.scene.manifest import Object, Scene
+from chromeball.scene.manifest import Object, Scene, Vector
 from chromeball.scene.pose import Pose
 
 #: What MeshLab reads without crashing on broken files (its FBX importer does).
@@ -55,7 +55,7 @@ def object_mesh(entry: Object, folder: str | os.PathLike[str] = ".") -> Mesh:
         ior=material.ior,
         normals=normals,
     )
-    return mesh.placed(_pose(entry), entry.scale)
+    return mesh.placed(pose_of(entry), entry.scale)
 
 
 def read_mesh(path: str | os.PathLike[str]) -> Triangles:
@@ -154,9 +154,14 @@ def face_areas(vertices: NDArray[np.float32], faces: NDArray[np.int64]) -> NDArr
     return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
 
 
-def _pose(entry: Object) -> Pose:
-    """Turned about x, then y, then z, then moved."""
+def pose_of(entry: Object) -> Pose:
+    """Where the object is: turned about x, then y, then z, then moved."""
+    return Pose(turn(entry.rotation), np.array(entry.position, float))
+
+
+def turn(degrees: Vector) -> NDArray[np.float64]:
+    """The rotation (3, 3) about x, then y, then z, by so many degrees."""
     pose = Pose.identity()
-    for axis, degrees in zip(np.eye(3), entry.rotation, strict=True):
-        pose = Pose.from_rotation_vector(axis * np.radians(degrees), np.zeros(3)) @ pose
-    return Pose(pose.rotation, np.array(entry.position, float))
+    for axis, angle in zip(np.eye(3), degrees, strict=True):
+        pose = Pose.from_rotation_vector(axis * np.radians(angle), np.zeros(3)) @ pose
+    return pose.rotation

@@ -2,21 +2,33 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import sys
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
 from chromeball.scene.errors import UserError
-from chromeball.scene.manifest import read_scene
+from chromeball.scene.manifest import Scene, View, parse_frames, read_scene
+from chromeball.scene.sequence import frames_of, missing_plates, moves
+
+if TYPE_CHECKING:
+    from chromeball.renderer.frames import Outcome, Task
+    from chromeball.renderer.render import Progress
 
 
 def render(
     scene_file: Path,
     *,
     view: str | None = None,
+    frames: str | None = None,
+    tile: str | None = None,
+    join: Annotated[bool, Parameter(negative="")] = False,
+    force: Annotated[bool, Parameter(negative="")] = False,
     spp: int | None = None,
     seconds: float | None = None,
     error: float | None = None,
@@ -26,7 +38,8 @@ def render(
     """Render a view of the scene into an EXR with its layers, and a PNG beside it.
 
     Without --spp, --seconds or --error the scene file says how many samples; with more than
-    one of them the first that is reached ends the work.
+    one of them the first that is reached ends the work. Frames and tiles that are finished
+    are kept, so that a sequence that was interrupted goes on.
 
     Parameters
     ----------
@@ -34,6 +47,15 @@ def render(
         The scene.toml.
     view
         Name of the view; needed where the scene has several.
+    frames
+        Frames of a sequence: 1-48, 1-48:2 or 7; by default those of the view.
+    tile
+        Make one tile of the picture: 1/4 is the first of four, 4 all of them. The last one
+        joins them.
+    join
+        Join tiles that were made elsewhere.
+    force
+        Make finished frames and tiles again.
     spp
         Samples a pixel.
     seconds
@@ -41,62 +63,164 @@ def render(
     error
         Stop when the standard error of the changed pixels, relative to their mean, is below.
     output
-        The EXR; by default VIEW.exr in the scene's build folder.
+        The EXR, by default VIEW.exr in the scene's build folder, VIEW.%04d.exr for frames.
     json_
         Print the figures as JSON.
 
     """
     scene = read_scene(scene_file)
+    chosen = _view(scene, scene_file, view)
+    numbers = _frames(scene, scene_file, chosen, frames)
+    sequence = [number for number in numbers if number is not None]
+    if sequence and output is not None and "%" not in output.name:
+        raise UserError("a sequence has one file a frame; write %04d in its name", file=output)
+    if join and tile:
+        raise UserError("--join takes the tiles that lie there: leave out --tile")
+
+    from chromeball.renderer import frames as jobs
+    from chromeball.renderer.render import Budget
+
+    budget = Budget(spp, seconds, error)
+    parts = [None] if tile is None else jobs.Tile.parse(tile)
+    tasks = [
+        jobs.Task(
+            str(scene_file),
+            chosen.name,
+            budget,
+            number,
+            part,
+            None if output is None else str(output),
+        )
+        for number in numbers
+        for part in parts
+    ]
+    if not join:
+        missing_plates(chosen, sequence, scene_file.parent)
+    total = spp if spp is not None else scene.render.spp if budget == Budget() else None
+    outcomes = map(jobs.join, tasks) if join else _locally(tasks, force, total)
+    _report(list(outcomes), as_json=json_)
+
+
+def _view(scene: Scene, scene_file: Path, name: str | None) -> View:
     names = [entry.name for entry in scene.view]
     if not names:
         raise UserError("the scene has no [[view]] to render", file=scene_file)
-    if view is None and len(names) > 1:
+    if name is None and len(names) > 1:
         raise UserError(
             f"the scene has several views; choose one with --view: {', '.join(names)}",
             file=scene_file,
         )
-    if view is not None and view not in names:
+    if name is not None and name not in names:
         raise UserError(
-            f"there is no [[view]] named {view!r}; there are {', '.join(names)}",
+            f"there is no [[view]] named {name!r}; there are {', '.join(names)}",
             file=scene_file,
         )
-    chosen = scene.view[0 if view is None else names.index(view)]
+    return scene.view[0 if name is None else names.index(name)]
 
+
+def _frames(scene: Scene, scene_file: Path, view: View, given: str | None) -> list[int | None]:
+    """Frames to make; None alone for a still."""
+    if given is not None:
+        return [*parse_frames(given)]
+    numbers = frames_of(view)
+    if not numbers and moves(scene, view):
+        raise UserError(
+            f"view {view.name!r} is a sequence: say --frames 1-48, or give it frames",
+            file=scene_file,
+        )
+    return [*numbers] or [None]
+
+
+def _locally(tasks: Sequence[Task], force: bool, total: int | None) -> Iterator[Outcome]:
+    """Make the tasks here, one after the other; one that fails does not keep others back."""
+    from chromeball.renderer.frames import Outcome, make
+
+    with _bar(total, len(tasks)) as (begin, progress):
+        for task in tasks:
+            begin(str(task))
+            still = task.frame is None and task.tile is None
+            try:
+                yield make(task, force=force or still, progress=progress)
+            except UserError as error:
+                if len(tasks) == 1:
+                    raise
+                yield Outcome(task, "failed", error=str(error))
+
+
+@contextmanager
+def _bar(total: int | None, count: int) -> Generator[tuple[Callable[[str], None], Progress]]:
+    """A progress bar on a terminal: what is made, its samples, its error, how many are done."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-    from chromeball.renderer.render import Budget, render_view
-
-    budget = Budget(spp, seconds, error)
-    total = spp if spp is not None else scene.render.spp if budget == Budget() else None
     columns = (
-        TextColumn("render {task.fields[name]}"),
+        TextColumn("render {task.description}"),
         BarColumn(),
-        TextColumn("{task.completed:.0f} spp"),
+        TextColumn("{task.completed:.0f} spp{task.fields[error]}{task.fields[done]}"),
         TimeElapsedColumn(),
     )
     with Progress(
         *columns, console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()
     ) as bar:
-        task = bar.add_task("render", total=total, name=chosen.name)
-        figures = render_view(
-            scene,
-            scene_file,
-            chosen,
-            budget,
-            output,
-            lambda samples, _: bar.update(task, completed=samples),
-        )
-    if json_:
-        json.dump(figures, sys.stdout)
+        row = bar.add_task("", total=total, error="", done="")
+        begun = itertools.count()
+
+        def begin(name: str) -> None:
+            done = f", {next(begun)} of {count} done" if count > 1 else ""
+            bar.reset(row, total=total, description=name, error="", done=done)
+
+        def progress(samples: int, error: float | None) -> None:
+            noise = "" if error is None else f", error {error:.2%}"
+            bar.update(row, completed=samples, error=noise)
+
+        yield begin, progress
+
+
+def _report(outcomes: Sequence[Outcome], *, as_json: bool) -> None:
+    """Print what became of the tasks; raise where some failed."""
+    single = len(outcomes) == 1 and outcomes[0].task.frame is None
+    if as_json:
+        rows = [_row(outcome) for outcome in outcomes]
+        json.dump(outcomes[0].figures if single else rows, sys.stdout)
         print()
-        return
-    spread = figures["relative_error"]
-    noise = f"{spread:.2%}" if isinstance(spread, float) else "unknown"
-    target = output or scene_file.parent / scene.folder / f"{chosen.name}.exr"
-    print(
-        f"{target}: {figures['spp']} spp in {figures['seconds']:.1f} s, "
-        f"{figures['mrays_per_second']:.1f} Mrays/s, {figures['changed_pixels']} pixels "
-        f"changed, noise {noise} of their mean; "
-        f"{figures['png']} beside it"
-    )
+    else:
+        for outcome in outcomes:
+            print(_line(outcome))
+    failed = [outcome for outcome in outcomes if outcome.state == "failed"]
+    if failed:
+        raise UserError(
+            f"{len(failed)} of {len(outcomes)} failed, first {failed[0].task}: "
+            f"{failed[0].error}"
+        )
+
+
+def _row(outcome: Outcome) -> dict[str, object]:
+    tile = outcome.task.tile
+    return {
+        "frame": outcome.task.frame,
+        "tile": None if tile is None else str(tile),
+        "state": outcome.state,
+        "output": outcome.output,
+        "error": outcome.error or None,
+        "figures": outcome.figures,
+    }
+
+
+def _line(outcome: Outcome) -> str:
+    figures = outcome.figures
+    match outcome.state:
+        case "failed":
+            return f"{outcome.task}: failed: {outcome.error}"
+        case "kept":
+            return f"{outcome.output}: finished before, kept"
+        case "rendered" if "changed_pixels" not in figures:  # a tile
+            return f"{outcome.output}: {figures['spp']} spp in {figures['seconds']:.1f} s"
+        case "rendered":
+            spread, speed = figures["relative_error"], figures["mrays_per_second"]
+            noise = f"{spread:.2%}" if isinstance(spread, float) else "unknown"
+            rays = f", {speed:.1f} Mrays/s" if isinstance(speed, float) else ""
+            return (
+                f"{outcome.output}: {figures['spp']} spp in {figures['seconds']:.1f} s{rays}, "
+                f"{figures['changed_pixels']} pixels changed, noise {noise} of their mean; "
+                f"{figures['png']} beside it"
+            )

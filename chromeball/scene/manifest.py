@@ -7,6 +7,7 @@ throughout. An unknown key is an error that names the nearest known one.
 from __future__ import annotations
 
 import difflib
+import itertools
 import math
 import os
 import re
@@ -195,11 +196,25 @@ class Material(Table, frozen=True):
     ior: Annotated[float, Meta(ge=1, le=4)] = 1.5
 
 
+class ObjectKey(Table, frozen=True):
+    """Where an object is at a ``frame`` of a sequence; what is left out has no key here."""
+
+    frame: float
+    position: Vector | None = None
+    rotation: Vector | None = None
+    scale: float | tuple[float, float, float] | None = None
+
+    def __post_init__(self) -> None:
+        _check_scale(self.scale)
+
+
 class Object(Table, frozen=True):
     """A synthetic object.
 
     ``mesh`` is sphere, box or cylinder (unit size, standing on y = 0), or a mesh file; scaled,
-    then rotated (degrees about x, y, z in turn), then moved to ``position``.
+    then rotated (degrees about x, y, z in turn), then moved to ``position``. ``key`` moves it
+    over the frames of a sequence (:mod:`chromeball.scene.sequence`); ``interpolation``:
+    positions run straight from key to key, or along a ``cubic`` curve (Catmull-Rom).
     """
 
     name: Name
@@ -209,21 +224,36 @@ class Object(Table, frozen=True):
     # msgspec 0.22 corrupts memory on a bounded float beside a tuple: bounds are checked below
     scale: float | tuple[float, float, float] = 1.0
     material: Material = Material()
+    key: list[ObjectKey] = []
+    interpolation: Literal["linear", "cubic"] = "linear"
 
     def __post_init__(self) -> None:
-        sides = self.scale if isinstance(self.scale, tuple) else (self.scale,)
-        if not all(0 < side < math.inf for side in sides):
-            raise ValueError("scale must be positive")
+        _check_scale(self.scale)
+
+
+class ViewKey(Table, frozen=True):
+    """Where a virtual camera is at a ``frame``; what is left out has no key here."""
+
+    frame: float
+    position: Vector | None = None
+    look_at: Vector | None = None
+    rotation: Vector | None = None
+    fov: float | None = None
 
 
 class View(Table, frozen=True):
-    """A picture to make.
+    """A picture to make, or a sequence of them.
 
     With ``bracket`` or ``plate`` (a radiance EXR) a photograph is the background; its camera is
     the calibrated one (``camera`` names a file, default the result of `calibrate lens`) and its
     place follows from ``points``, where the four corners of the `align` rectangle lie in the
-    plate. Without, the panorama is the background, seen from the probe's place by a virtual
-    camera: ``model``, ``size``, ``fov`` degrees, turned to ``look_at`` (a point in metres).
+    plate. Without, the panorama is the background, seen by a virtual camera: ``model``,
+    ``size``, ``fov`` degrees, at ``position`` (the probe's place unless given), turned to
+    ``look_at`` (a point in metres) or by ``rotation``: it looks along -z, +y up, and is turned
+    by so many degrees about x, y, z in turn.
+
+    A sequence has ``frames`` ("1-48", "1-48:2", "7"), and ``plate`` and ``camera`` may hold
+    the frame's number (``plates/%04d.exr``); ``key`` moves a virtual camera as an object's.
     """
 
     name: Name
@@ -237,7 +267,12 @@ class View(Table, frozen=True):
     size: tuple[Annotated[int, Meta(ge=1)], Annotated[int, Meta(ge=1)]] = (640, 480)
     fov: Annotated[float, Meta(gt=0, le=360)] = 60.0
     look_at: Vector = (0.0, 0.0, 0.0)
+    position: Vector | None = None
+    rotation: Vector | None = None
     exposure: Positive | None = None
+    frames: str | None = None
+    key: list[ViewKey] = []
+    interpolation: Literal["linear", "cubic"] = "linear"
 
 
 class Calibrate(Table, frozen=True):
@@ -288,6 +323,12 @@ class Scene(Table, frozen=True):
                 return bracket
         near = _nearest(name, [bracket.name for bracket in self.bracket])
         raise UserError(f"there is no [[bracket]] named {name!r}{near}")
+
+
+def _check_scale(scale: float | tuple[float, float, float] | None) -> None:
+    sides = scale if isinstance(scale, tuple) else (1.0 if scale is None else scale,)
+    if not all(0 < side < math.inf for side in sides):
+        raise ValueError("scale must be positive")
 
 
 def read_scene(path: str | os.PathLike[str]) -> Scene:
@@ -360,6 +401,58 @@ def _check_names(scene: Scene) -> None:
         for time in bracket.times:
             parse_time(time)
     _check_hdr(scene.hdr, scene.bracket)
+    for view in scene.view:
+        _check_view(view)
+        _check_keys(view.name, view.key)
+    for entry in scene.object:
+        _check_keys(entry.name, entry.key)
+
+
+def _check_keys(name: str, keys: Sequence[ObjectKey | ViewKey]) -> None:
+    if any(b.frame <= a.frame for a, b in itertools.pairwise(keys)):
+        raise UserError(f"{name!r}: the frames of its keys must rise")
+
+
+def _check_view(view: View) -> None:
+    name = f"view {view.name!r}"
+    if view.frames is not None:
+        parse_frames(view.frames)
+    for value in (view.plate, view.camera):
+        if value and len(re.findall(r"%0?\d*d", value)) > 1:
+            raise UserError(f"{name}: {value!r} holds more than one number")
+    moved = view.position is not None or view.rotation is not None or bool(view.key)
+    if moved and (view.bracket or view.plate):
+        raise UserError(
+            f"{name} has a photograph, and its camera is where that was taken: leave out "
+            "position, rotation and key; a moving camera has one file a frame, camera = "
+            '"cameras/%04d.cameramodel"'
+        )
+    for key in view.key:
+        if key.fov is not None and not 0 < key.fov <= 360:
+            raise UserError(f"{name}: fov at frame {key.frame:g} is not between 0 and 360")
+        if key.rotation is not None and key.look_at is not None:
+            raise UserError(f"{name}: a key has look_at or rotation, not both")
+    turned = view.rotation is not None or any(key.rotation is not None for key in view.key)
+    if turned and any(key.look_at is not None for key in view.key):
+        raise UserError(f"{name} has keys of look_at and a rotation; keep one of the two")
+
+
+_NONE = (None, None, None)
+
+
+def parse_frames(text: str) -> list[int]:
+    """Frame numbers of ``7``, ``1-48``, ``1-48:2`` or several of these with commas, rising."""
+    frames: set[int] = set()
+    for part in text.split(","):
+        found = re.fullmatch(r"\s*(\d{1,9})(?:-(\d{1,9})(?::(\d{1,9}))?)?\s*", part)
+        first, last, step = (int(g) if g else None for g in found.groups()) if found else _NONE
+        if first is None or step == 0 or (last is not None and last < first):
+            raise UserError(f"{text!r:.60} are no frames: write 7, 1-48 or 1-48:2")
+        chosen = range(first, (first if last is None else last) + 1, step or 1)
+        if len(frames) + len(chosen) > 1_000_000:
+            raise UserError(f"{text!r:.60} are more than a million frames")
+        frames.update(chosen)
+    return sorted(frames)
 
 
 def _check_hdr(hdr: Hdr, brackets: Sequence[Bracket]) -> None:

@@ -209,6 +209,10 @@ class Stage:
         self._cpu = time.process_time()
         return self
 
+    def elapsed(self) -> float:
+        """Seconds since the stage began."""
+        return time.perf_counter() - self._start
+
     @contextmanager
     def output(self, path: str | os.PathLike[str]) -> Generator[Path]:
         """As :func:`atomic_output`; the output gets a record when the stage ends well."""
@@ -233,7 +237,7 @@ class Stage:
             "options": self.options,
             "outputs": [os.fspath(path) for path in self.outputs],
             "figures": self.figures,
-            "seconds": time.perf_counter() - self._start,
+            "seconds": self.elapsed(),
             "cpu_seconds": time.process_time() - self._cpu,
             "peak_memory_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
             "finished": datetime.now(UTC).isoformat(timespec="seconds"),

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from chromeball.cli.main import build_app
 from chromeball.renderer.render import Budget, virtual_camera
 from chromeball.renderer.scene import read_mesh
 from chromeball.scene.camera import CameraModel
@@ -16,43 +15,12 @@ from chromeball.scene.errors import UserError
 from chromeball.scene.image import read_image, write_exr
 from chromeball.scene.manifest import View
 from chromeball.scene.pose import Pose
-from chromeball.stand_in.ply import StandInMesh, write_stand_in
-
-SCENE = """
-name = "small"
-[[stand_in]]
-name = "floor"
-kind = "plane"
-size = [4, 4]
-[[object]]
-name = "ball"
-mesh = "sphere"
-scale = 0.5
-[[view]]
-name = "main"
-size = [40, 30]
-[render]
-spp = 4
-"""
+from tests.renderer.scenes import SCENE, run, write_scene
 
 
 @pytest.fixture
 def scene(tmp_path: Path) -> Path:
-    sky = np.full((16, 32, 3), 0.5, np.float32)
-    sky[3, 9] = 40
-    write_exr(tmp_path / "build/env.exr", sky, attributes={"origin": (0.0, 1.0, 1.5)})
-    v = np.array([[-2, 0, 2], [2, 0, 2], [2, 0, -2], [-2, 0, -2]], np.float32)
-    faces = np.array([[0, 1, 2], [0, 2, 3]], np.uint32)
-    write_stand_in(
-        tmp_path / "build/stand_in.ply", StandInMesh(v, v, faces, np.zeros(2, np.uint8))
-    )
-    file = tmp_path / "scene.toml"
-    file.write_text(SCENE)
-    return file
-
-
-def run(*arguments: str | Path) -> None:
-    build_app()([str(a) for a in arguments], exit_on_error=False, result_action="return_value")
+    return write_scene(tmp_path)
 
 
 def test_a_view_becomes_an_exr_with_layers_and_a_png(

@@ -1,0 +1,193 @@
+"""Sequences: a scene whose objects and cameras have keys, as it stands at one frame.
+
+What is keyed is interpolated property by property, each between the keys that name it, and
+held before the first and after the last. Positions, points and field of view run linearly, or
+along a cubic Hermite curve with Catmull-Rom tangents (Catmull and Rom 1974; for uneven frames
+the slope from the key before to the key after); scales do so in their logarithm; rotations
+turn at constant speed about one axis from key to key the shorter way (slerp, Shoemake 1985).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from chromeball.scene.errors import UserError
+from chromeball.scene.manifest import Object, Scene, Vector, View, parse_frames
+
+type Interpolation = Literal["linear", "cubic"]
+
+#: Tables of the scene file that the renderer does not read: it reads what they made.
+_CAPTURE = frozenset(
+    {"name", "bracket", "hdr", "calibrate", "probe", "align", "env", "stand_in", "truth"}
+)
+_NUMBER = re.compile(r"%0?\d*d")
+
+
+def moves(scene: Scene, view: View) -> bool:
+    """Whether a view is a sequence: keys, frames, or numbers in its files' names."""
+    numbered = any(_NUMBER.search(name) for name in (view.plate, view.camera) if name)
+    keyed = bool(view.key) or any(entry.key for entry in scene.object)
+    return view.frames is not None or numbered or keyed
+
+
+def frames_of(view: View) -> list[int]:
+    """The frames that the scene file gives the view; none where it gives none."""
+    return [] if view.frames is None else parse_frames(view.frames)
+
+
+def at(scene: Scene, frame: int) -> Scene:
+    """The scene at a frame, without keys: a still of its own.
+
+    Numbered files are named; the seed is the scene's plus the frame's number, so that the
+    noise of frames is independent.
+    """
+    still = posed(scene, frame)
+    views = [
+        msgspec.structs.replace(
+            view,
+            plate=numbered(view.plate, frame),
+            camera=numbered(view.camera, frame),
+            frames=None,
+        )
+        for view in still.view
+    ]
+    render = msgspec.structs.replace(scene.render, seed=scene.render.seed + frame)
+    return msgspec.structs.replace(still, view=views, render=render)
+
+
+def posed(scene: Scene, time: int | float) -> Scene:
+    """The scene with its objects and cameras as they are at a time, in frames."""
+    return msgspec.structs.replace(
+        scene,
+        object=[object_at(entry, time) for entry in scene.object],
+        view=[view_at(view, time) for view in scene.view],
+    )
+
+
+def object_at(entry: Object, time: int | float) -> Object:
+    """The object as it is at a time, in frames, without keys."""
+    if not entry.key:
+        return entry
+    position = [(k.frame, k.position) for k in entry.key if k.position is not None]
+    rotation = [(k.frame, k.rotation) for k in entry.key if k.rotation is not None]
+    scale = [(k.frame, _sides(k.scale)) for k in entry.key if k.scale is not None]
+    sides = _interpolate([(t, tuple(np.log(s))) for t, s in scale], time, entry.interpolation)
+    return msgspec.structs.replace(
+        entry,
+        position=_vector(_interpolate(position, time, entry.interpolation), entry.position),
+        rotation=_turn(rotation, time) or entry.rotation,
+        scale=entry.scale if sides is None else _vector(np.exp(sides), (1.0, 1.0, 1.0)),
+        key=[],
+    )
+
+
+def view_at(view: View, time: int | float) -> View:
+    """The view as it is at a time, in frames, without keys."""
+    if not view.key:
+        return view
+    position = [(k.frame, k.position) for k in view.key if k.position is not None]
+    look_at = [(k.frame, k.look_at) for k in view.key if k.look_at is not None]
+    rotation = [(k.frame, k.rotation) for k in view.key if k.rotation is not None]
+    fov = [(k.frame, (k.fov,)) for k in view.key if k.fov is not None]
+    angle = _interpolate(fov, time, view.interpolation)
+    place = _interpolate(position, time, view.interpolation)
+    return msgspec.structs.replace(
+        view,
+        position=view.position if place is None else _vector(place, (0.0, 0.0, 0.0)),
+        look_at=_vector(_interpolate(look_at, time, view.interpolation), view.look_at),
+        rotation=_turn(rotation, time) or view.rotation,
+        # a cubic curve may swing a little beyond its keys
+        fov=view.fov if angle is None else float(np.clip(angle[0], 1e-3, 360)),
+        key=[],
+    )
+
+
+def numbered(name: str | None, frame: int) -> str | None:
+    """The file's name with the frame's number in it: ``plates/%04d.exr``."""
+    return name and _NUMBER.sub(lambda found: found[0] % frame, name)
+
+
+def rendered_part(scene: Scene, view: View) -> dict[str, Any]:
+    """What of a still's scene file decides the picture of one view; the rest may change."""
+    part: dict[str, Any] = msgspec.to_builtins(scene)
+    kept = {key: value for key, value in part.items() if key not in _CAPTURE}
+    return {**kept, "view": msgspec.to_builtins(view)}
+
+
+def missing_plates(view: View, frames: Sequence[int], folder: Path) -> None:
+    """Refuse a sequence of which numbered files are missing, before any work.
+
+    Raises
+    ------
+    UserError
+        That names the first frame whose plate or camera is not there.
+
+    """
+    for what, name in (("plate", view.plate), ("camera", view.camera)):
+        if not name or not _NUMBER.search(name):
+            continue
+        gone = [n for n in frames if not (folder / str(numbered(name, n))).is_file()]
+        if gone:
+            more = f" (and of {len(gone) - 1} more)" if len(gone) > 1 else ""
+            raise UserError(
+                f"the {what} of frame {gone[0]}{more} is missing; put it there, or leave the "
+                "frame out with --frames",
+                file=folder / str(numbered(name, gone[0])),
+            )
+
+
+def _interpolate(
+    keys: Sequence[tuple[float, Sequence[float]]],
+    time: int | float,
+    interpolation: Interpolation,
+) -> NDArray[np.float64] | None:
+    """Values (n,) at a time among keys (frame, values), held outside; None without keys."""
+    if not keys:
+        return None
+    t = np.array([frame for frame, _ in keys], float)
+    values = np.array([value for _, value in keys], float)
+    if len(t) == 1:
+        return values[0]
+    now = float(np.clip(time, t[0], t[-1]))
+    if interpolation == "linear":
+        return np.array([np.interp(now, t, column) for column in values.T])
+    from scipy.interpolate import CubicHermiteSpline
+
+    slopes = np.empty_like(values)
+    slopes[1:-1] = (values[2:] - values[:-2]) / (t[2:] - t[:-2])[:, None]
+    slopes[0] = (values[1] - values[0]) / (t[1] - t[0])
+    slopes[-1] = (values[-1] - values[-2]) / (t[-1] - t[-2])
+    return np.asarray(CubicHermiteSpline(t, values, slopes)(now), float)
+
+
+def _turn(keys: Sequence[tuple[float, Vector]], time: int | float) -> Vector | None:
+    """Degrees about x, y, z in turn at a time among keys; None without keys."""
+    if not keys:
+        return None
+    t = np.array([frame for frame, _ in keys], float)
+    near = np.flatnonzero(t == np.clip(time, t[0], t[-1]))
+    if near.size:  # a key's own angles, not others that mean the same
+        return keys[int(near[0])][1]
+    from scipy.spatial.transform import Rotation, Slerp
+
+    turns = Rotation.from_euler("xyz", np.array([angles for _, angles in keys]), degrees=True)
+    angles = Slerp(t, turns)(time).as_euler("xyz", degrees=True, suppress_warnings=True)
+    return _vector(angles, (0.0, 0.0, 0.0))
+
+
+def _sides(scale: float | tuple[float, float, float]) -> tuple[float, float, float]:
+    return scale if isinstance(scale, tuple) else (scale, scale, scale)
+
+
+def _vector(values: NDArray[np.float64] | None, otherwise: Vector) -> Vector:
+    if values is None:
+        return otherwise
+    x, y, z = (float(v) for v in values)
+    return x, y, z
