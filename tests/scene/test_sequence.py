@@ -9,7 +9,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -50,6 +50,7 @@ def test_what_has_no_key_stays() -> None:
     assert object_at(entry, 0).scale == 1.0
 
 
+@settings(deadline=None)
 @given(st.floats(0, 20), st.lists(st.floats(-5, 5), min_size=2, max_size=6))
 def test_a_cubic_path_follows_any_line_exactly_and_meets_its_keys(
     time: float, jumps: list[float]
@@ -176,6 +177,7 @@ def test_frame_ranges() -> None:
             parse_frames(wrong)
 
 
+@settings(deadline=None)
 @given(st.text(max_size=12))
 def test_any_text_is_frames_or_a_mistake(text: str) -> None:
     try:
