@@ -33,7 +33,7 @@ void Captured::find_planes() {
       for (int k = 0; k < 3; ++k) {
         moved |= !is_zero(stand_in.corner(hit.face, k) - stand_in.original_corner(hit.face, k));
       }
-      const Vec3 n = normalize(hit.ng);
+      const Vec3 n = stand_in.normal(hit.face);
       planes_[t] = {n, moved ? NAN : dot(n, stand_in.corner(hit.face, 0))};
     }
   });
@@ -43,17 +43,19 @@ Place Captured::trace(Vec3 o, Vec3 d, float tfar) const {
   if (accel_.empty()) return {};
   const Hit hit = accel_.intersect(o, d, tfar);
   if (!hit) return {};
+  const float w = 1 - hit.u - hit.v;
   const auto at = [&](auto corner) {
-    const Vec3 a = corner(0);
-    return a + hit.u * (corner(1) - a) + hit.v * (corner(2) - a);
+    return w * corner(0) + hit.u * corner(1) + hit.v * corner(2);
   };
   Place place;
   place.t = hit.t;
   place.face = hit.face;
   place.p = at([&](int k) { return stand_in_.corner(hit.face, k); });
   place.captured_at = at([&](int k) { return stand_in_.original_corner(hit.face, k); });
-  const Vec3 n = normalize(hit.ng);
+  const Vec3 n = stand_in_.normal(hit.face);
   place.n = dot(n, d) < 0 ? n : -n;
+  place.rise = rise(at([&](int k) { return abs(stand_in_.corner(hit.face, k)); }) +
+                        abs(place.p), n);
   place.support = stand_in_.surface[hit.face] == 0;
   return place;
 }
@@ -94,7 +96,7 @@ Captured::Sample Captured::sample(Vec3 x, Pair u) const {
   const Vec3 to = light.place - x;
   const float x2 = length2(to), t = std::sqrt(x2);
   const float cos_x = std::abs(dot(to, light.n)) / t;
-  if (!(t > 1e-5f && cos_x > 1e-6f)) return {};
+  if (!(t > 0 && cos_x > 1e-6f)) return {};
   return {to * (1 / t), t, light.density * x2 / cos_x};
 }
 
@@ -110,7 +112,7 @@ float Captured::density(Vec3 x, Vec3 d, const Place& place) const {
   const Vec3 w = from_o * (1 / distance);
   const Plane& plane = planes_[environment_.texel_of(w)];
   const float off = dot(plane.n, place.p) - plane.offset;
-  if (is_zero(plane.n) || !(std::abs(off) < 1e-4f * (1 + distance))) return 0;
+  if (is_zero(plane.n) || !(std::abs(off) < 1e-4f * distance + kLift * largest_magnitude(place.p))) return 0;
   return environment_.density(w) * jacobian(x, place.p, plane.n);
 }
 

@@ -23,6 +23,12 @@ struct StandIn {
   Vec3 original_corner(uint32_t face, int k) const {
     return Vec3(&original[3 * faces[3 * face + k]]);
   }
+  // Unit, around the corners; up for a face without area.
+  Vec3 normal(uint32_t face) const {
+    const Vec3 a = corner(face, 0), b = corner(face, 1) - a, c = corner(face, 2) - a;
+    const float grow = 1 / std::max({largest_magnitude(b), largest_magnitude(c), 1e-37f});
+    return unit_or(cross(b * grow, c * grow), {0, 1, 0});
+  }
 };
 
 // The first stand-in surface on a ray, or the infinite environment.
@@ -32,7 +38,9 @@ struct Place {
   Vec3 captured_at;  // where p stood when the map was captured
   uint32_t face = 0;
   bool support = false;
+  float rise = 0;    // how far from the face a ray has to start
   explicit operator bool() const { return t < kInfinity; }
+  Vec3 start() const { return p + rise * n; }
 };
 
 class Captured {

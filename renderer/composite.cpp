@@ -6,8 +6,10 @@
 namespace chromeball {
 namespace {
 
-constexpr int kSpecularBounces = 24;  // a path lost between mirrors ends here, black
+constexpr int kMostScatterings = 24;  // a path lost between mirrors ends here, black
+constexpr int kMostPassed = 256;
 
+bool is_one(Vec3 v) { return v.x == 1 && v.y == 1 && v.z == 1; }
 void add(float* to, Vec3 v) { to[0] += v.x, to[1] += v.y, to[2] += v.z; }
 
 }  // namespace
@@ -74,24 +76,38 @@ struct Compositor::Cones {
   }
 };
 
-Compositor::Compositor(const Mesh& objects, std::vector<Sphere> bounds, const StandIn& stand_in,
-                       const Environment& environment, Vec3 origin, int bounces, uint64_t seed,
-                       uint32_t expected_samples)
-    : objects_(objects),
-      bounds_(std::move(bounds)),
+Compositor::Compositor(World& objects, const StandIn& stand_in, const Environment& environment,
+                       Vec3 origin, int bounces, uint64_t seed, uint32_t expected_samples)
+    : objects_(&objects),
       captured_(stand_in, environment, origin, seed),
       irradiance_(captured_, seed),
       table_(expected_samples, seed),
       bounces_(bounces),
       seed_(mix64(seed + 0x436f6d70u)) {
-  if (bounds_.size() > size_t(Cones::kMost)) {
-    throw std::invalid_argument("too many bounding spheres");
+  find_bounds();
+}
+
+void Compositor::place(World& objects) {
+  objects_ = &objects;
+  find_bounds();
+}
+
+void Compositor::move(uint32_t object, const double* matrix) {
+  objects_->move(object, matrix);
+  find_bounds();
+}
+
+void Compositor::find_bounds() {
+  const auto all = objects_->bounds();
+  bounds_.assign(all.begin(), all.end());
+  if (bounds_.size() <= size_t(Cones::kMost)) return;
+  Vec3 low(kInfinity), high(-kInfinity);
+  for (const Sphere& s : bounds_) {
+    const Vec3 r(s.radius), a = s.centre - r, b = s.centre + r;
+    low = {std::min(low.x, a.x), std::min(low.y, a.y), std::min(low.z, a.z)};
+    high = {std::max(high.x, b.x), std::max(high.y, b.y), std::max(high.z, b.z)};
   }
-  if (objects.size()) {
-    accel_.add(objects.vertices.data(), objects.vertices.size() / 3, objects.faces.data(),
-               objects.size());
-  }
-  accel_.commit();
+  bounds_ = {{0.5f * low + 0.5f * high, 0.5f * length(high - low)}};
 }
 
 bool Compositor::may_hit(Vec3 o, Vec3 d) const {
@@ -103,10 +119,30 @@ bool Compositor::may_hit(Vec3 o, Vec3 d) const {
   return false;
 }
 
-Hit Compositor::meet_object(Vec3 o, Vec3 d, float tfar, Path& path) const {
+Hit Compositor::meet_object(Vec3 o, Vec3 d, float tfar, Vec3& share, Path& path) const {
   if (!may_hit(o, d)) return {};
   ++path.rays;
-  return accel_.intersect(o, d, tfar);
+  Hit hit = objects_->intersect(o, d, tfar);
+  if (!objects_->transmits()) return hit;
+  float before = 0;
+  for (int k = 0; k < kMostPassed && hit && objects_->material(hit).transmits; ++k) {
+    const Surface s = objects_->surface_at(hit, d);
+    const Vec3 through = transmit(s, -d);
+    const float pass = mean(through);
+    if (pass <= 0) break;
+    if (pass < 1 && path.sampler.pair().x >= pass) {
+      share *= 1 / (1 - pass);
+      break;
+    }
+    share *= through * (1 / pass);
+    const Vec3 next = s.start(d);
+    before += dot(next - o, d);
+    o = next;
+    ++path.rays;
+    hit = objects_->intersect(o, d, tfar - before);
+  }
+  if (hit) hit.t += before;
+  return hit;
 }
 
 Place Compositor::meet_stand_in(Vec3 o, Vec3 d, float tfar, Path& path) const {
@@ -115,60 +151,63 @@ Place Compositor::meet_stand_in(Vec3 o, Vec3 d, float tfar, Path& path) const {
   return captured_.trace(o, d, tfar);
 }
 
-// Radiance that an object sends against d. Mirrors and glass are followed; `bounces` counts the
-// diffuse interreflections that are left, -1 makes a diffuse surface black.
+Compositor::Meeting Compositor::meet(Vec3 o, Vec3 d, Vec3& share, Path& path) const {
+  if (objects_->transmits()) {  // what lies behind the set must not dim it
+    const Place place = meet_stand_in(o, d, kInfinity, path);
+    const Hit hit = meet_object(o, d, place.t, share, path);
+    return {hit, hit ? Place() : place};
+  }
+  const Hit hit = meet_object(o, d, kInfinity, share, path);
+  const Place place = meet_stand_in(o, d, hit.t, path);
+  return {place ? Hit() : hit, place};
+}
+
+// Radiance that an object sends against d. Directions that are certain are always followed;
+// `bounces` counts the interreflections that are left, at -1 only lamps and mirrors are seen.
 Vec3 Compositor::object_radiance(Hit hit, Vec3 d, int bounces, Path& path) const {
   Vec3 sum, beta(1.0f);
-  for (int k = 0; k < kSpecularBounces; ++k) {
-    const Surface s = surface_at(objects_, hit, d);
-    sum += beta * objects_.face_emission(hit.face);
-    beta *= objects_.face_albedo(hit.face);
-    const Kind kind = Kind(objects_.kind[hit.face]);
-    if (kind == Kind::diffuse) {
-      if (bounces < 0 || largest(beta) == 0) return sum;
-      return sum + (1 / kPi) * beta * diffuse_light(s, bounces, path);
+  for (int k = 0; k < kMostScatterings; ++k) {
+    const Surface s = objects_->surface_at(hit, d);
+    sum += beta * s.emission;
+    const bool specular = is_specular(s);
+    if (!specular) {
+      if (bounces < 0) return sum;
+      sum += beta * direct_light(s, -d, bounces, path);
     }
-    const float u = kind == Kind::glass ? path.sampler.pair().x : 0.0f;
-    const Bounce b = bounce_specular(s, d, kind, objects_.ior[hit.face], u);
-    const Vec3 o = lift(s.p, b.through ? -s.ng : s.ng);
-    d = b.d;
-    hit = meet_object(o, d, kInfinity, path);
-    const Place place = meet_stand_in(o, d, hit.t, path);
-    if (place || !hit) return sum + beta * stand_in_radiance(place, d, bounces, path);
+    const Scatter next = sample(s, -d, path.sampler);
+    beta *= next.weight;
+    if (largest(beta) <= 0) return sum;
+    d = next.wi;
+    const Vec3 o = s.start(d);
+    const auto [object, place] = meet(o, d, beta, path);
+    hit = object;
+    if (!hit) {
+      const float other = next.density > 0 ? captured_.density(o, d, place) : 0;
+      const float w = other > 0 ? next.density / (next.density + other) : 1;
+      return sum + w * beta * stand_in_radiance(place, d, bounces, path);
+    }
+    if (next.blurs) --bounces;
   }
   return sum;
 }
 
-// The irradiance of an object's surface: light sampling for what comes straight from the
-// captured set, cosine sampling for all.
-Vec3 Compositor::diffuse_light(const Surface& s, int bounces, Path& path) const {
-  const Vec3 x = lift(s.p, s.ng);
-  Vec3 sum;
-  if (const auto light = captured_.sample(x, path.sampler.pair())) {
-    const float cos = dot(light.d, s.ns);
-    if (cos > 0 && dot(light.d, s.ng) > 0) {
-      const bool shadowed = may_hit(x, light.d) &&
-                            (++path.rays, accel_.occluded(x, light.d, light.t * (1 - 1e-4f)));
-      if (!shadowed) {
-        const Place place = meet_stand_in(x, light.d, kInfinity, path);
-        if (Captured::reaches(light, place)) {
-          sum += (cos / (light.density + cos / kPi)) *
-                 stand_in_radiance(place, light.d, bounces, path);
-        }
-      }
-    }
+// What comes straight from the captured set and is sent on to wo, by light sampling, weighted
+// against the surface's own sampling (the balance heuristic, Veach 1997).
+Vec3 Compositor::direct_light(const Surface& s, Vec3 wo, int bounces, Path& path) const {
+  const auto light = captured_.sample(s.p, path.sampler.pair());
+  if (!light) return {};
+  Vec3 f = shade(s, wo, light.d);
+  if (is_zero(f)) return {};
+  const Vec3 x = s.start(light.d);
+  if (may_hit(x, light.d)) {
+    ++path.rays;
+    f *= objects_->transmittance(x, light.d, light.t * (1 - 1e-4f));
+    if (is_zero(f)) return {};
   }
-  const Pair u = path.sampler.pair();
-  const Vec3 local = sample_cosine(u.x, u.y), d = Frame(s.ns).world(local);
-  if (dot(d, s.ng) <= 0) return sum;
-  const Hit hit = meet_object(x, d, kInfinity, path);
-  const Place place = meet_stand_in(x, d, hit.t, path);
-  if (hit && !place) {
-    return bounces > 0 ? sum + kPi * object_radiance(hit, d, bounces - 1, path) : sum;
-  }
-  const float cos = std::max(local.z, 1e-6f);
-  return sum + (cos / (captured_.density(x, d, place) + cos / kPi)) *
-                   stand_in_radiance(place, d, bounces, path);
+  const Place place = meet_stand_in(x, light.d, kInfinity, path);
+  if (!Captured::reaches(light, place)) return {};
+  return (1 / (light.density + density(s, wo, light.d))) * f *
+         stand_in_radiance(place, light.d, bounces, path);
 }
 
 // What a ray sees of the set with the objects in it: L_cap Q.
@@ -179,10 +218,12 @@ Vec3 Compositor::stand_in_radiance(const Place& place, Vec3 d, int bounces, Path
 }
 
 // (L_with - L_without) cos for a direction whose first hit is an object.
-Vec3 Compositor::change(Vec3 x, Vec3 d, float cos, const Hit& hit, const Place& behind,
+Vec3 Compositor::change(Vec3 d, float cos, const Hit& hit, Vec3 share, const Place& behind,
                         int bounces, Path& path) const {
-  const Vec3 with = object_radiance(hit, d, bounces - 1, path);
-  return cos * (with - captured_.radiance(behind, d));
+  const Vec3 without = captured_.radiance(behind, d);
+  // what came through thin surfaces to the set is seen there, coloured
+  if (!hit) return cos * (share - Vec3(1.0f)) * without;
+  return cos * (share * object_radiance(hit, d, bounces - 1, path) - without);
 }
 
 Vec3 Compositor::light_change(Vec3 x, Vec3 n, const Cones& cones, float share, int bounces,
@@ -191,12 +232,13 @@ Vec3 Compositor::light_change(Vec3 x, Vec3 n, const Cones& cones, float share, i
   if (!light) return {};
   const float cos = dot(light.d, n);
   if (cos <= 0) return {};
-  const Hit hit = meet_object(x, light.d, light.t, path);
-  if (!hit) return {};
+  Vec3 through(1.0f);
+  const Hit hit = meet_object(x, light.d, light.t, through, path);
+  if (!hit && is_one(through)) return {};
   const Place behind = meet_stand_in(x, light.d, kInfinity, path);
   if (!Captured::reaches(light, behind)) return {};
   const float density = share * (light.density + cones.density(light.d));
-  return (1 / density) * change(x, light.d, cos, hit, behind, bounces, path);
+  return (1 / density) * change(light.d, cos, hit, through, behind, bounces, path);
 }
 
 Vec3 Compositor::cone_change(Vec3 x, Vec3 n, const Cones& cones, float share, int bounces,
@@ -204,18 +246,21 @@ Vec3 Compositor::cone_change(Vec3 x, Vec3 n, const Cones& cones, float share, in
   const Vec3 d = cones.sample(path.sampler.pair());
   const float cos = dot(d, n);
   if (cos <= 0) return {};
-  const Hit hit = meet_object(x, d, kInfinity, path);
-  if (!hit) return {};
-  const Place behind = meet_stand_in(x, d, kInfinity, path);
-  if (behind && behind.t < hit.t) return {};
+  Vec3 through(1.0f);
+  Place behind;
+  if (objects_->transmits()) behind = meet_stand_in(x, d, kInfinity, path);
+  const Hit hit = meet_object(x, d, behind.t, through, path);
+  if (!hit && is_one(through)) return {};
+  if (!objects_->transmits()) behind = meet_stand_in(x, d, kInfinity, path);
+  if (hit && behind.t < hit.t) return {};
   const float density = share * (captured_.density(x, d, behind) + cones.density(d));
-  return (1 / density) * change(x, d, cos, hit, behind, bounces, path);
+  return (1 / density) * change(d, cos, hit, through, behind, bounces, path);
 }
 
 // An estimate of dE / E_without, by both strategies or by one of them at random. Nothing is
 // random where no sample meets an object: it is 0.
 Vec3 Compositor::relative_change(const Place& place, int bounces, bool both, Path& path) const {
-  const Vec3 x = lift(place.p, place.n);
+  const Vec3 x = place.start();
   const Cones cones(x, place.n, bounds_);
   if (cones.count == 0) return {};
   Vec3 dE;
@@ -253,10 +298,11 @@ uint64_t Compositor::pass(const PixelRays& rays, Vec3 camera, const float* plate
           const Pair u = sampler.pair();
           const Vec3 d = rays.direction(y, x, u.x, u.y);
           const Place place = meet_stand_in(camera, d, kInfinity, path);
-          const Hit hit = meet_object(camera, d, place.t, path);
+          Vec3 through(1.0f);
+          const Hit hit = meet_object(camera, d, place.t, through, path);
           Vec3 value = B;
           if (hit) {
-            value = object_radiance(hit, d, bounces_, path);
+            value = through * object_radiance(hit, d, bounces_, path);
             add(to + Film::kObject, value);
             to[Film::kCoverage] += 1;
           } else if (place.support) {
@@ -264,10 +310,17 @@ uint64_t Compositor::pass(const PixelRays& rays, Vec3 camera, const float* plate
             const Vec3 dL = is_zero(dQ) || !difference
                                 ? Vec3()
                                 : captured_.radiance(place, d) * dQ;
-            value = difference ? B + dL : B * (Vec3(1.0f) + dQ);
-            add(to + Film::kChange, dQ);
-            add(to + Film::kDifference, dL);
+            value = through * (difference ? B + dL : B * (Vec3(1.0f) + dQ));
+            add(to + Film::kChange, through * dQ);
+            add(to + Film::kDifference, through * dL);
             to[Film::kSupport] += 1;
+          } else {
+            value *= through;
+          }
+          if (!hit && !is_one(through)) {  // the plate, dimmed evenly and then coloured
+            const float grey = mean(through);
+            add(to + Film::kObject, (through - Vec3(grey)) * B);
+            to[Film::kCoverage] += 1 - grey;
           }
           if (const float t = std::min(hit.t, place.t); t < kInfinity) {
             to[Film::kDepth] += t;

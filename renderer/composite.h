@@ -6,15 +6,10 @@
 
 #include "captured.h"
 #include "irradiance.h"
-#include "mesh.h"
 #include "path.h"
+#include "world.h"
 
 namespace chromeball {
-
-struct Sphere {
-  Vec3 centre;
-  float radius;
-};
 
 // What the passes have added up, a row a pixel. Sums over the sub-samples:
 struct Film {
@@ -35,10 +30,13 @@ struct Film {
 
 class Compositor {
  public:
-  // `objects` joined, object k being faces first[k] .. first[k + 1].
-  Compositor(const Mesh& objects, std::vector<Sphere> bounds, const StandIn& stand_in,
-             const Environment& environment, Vec3 origin, int bounces, uint64_t seed,
-             uint32_t expected_samples);
+  Compositor(World& objects, const StandIn& stand_in, const Environment& environment,
+             Vec3 origin, int bounces, uint64_t seed, uint32_t expected_samples);
+
+  // Other objects.
+  void place(World& objects);
+  // A new place for an object.
+  void move(uint32_t object, const double* matrix);
 
   // Adds the next counts (H, W) sub-samples of each pixel to film (H, W, Film::kCount).
   // `plate` (H, W, 3) is only used to know how bright a change is. Returns rays traced.
@@ -48,7 +46,10 @@ class Compositor {
   // The captured set alone through the camera, mean of `count` sub-samples: a plate.
   void background(const PixelRays& rays, Vec3 camera, uint32_t count, float* radiance) const;
 
-  Vec3 irradiance(Vec3 p, Vec3 n) const { return irradiance_.solve(p, n); }
+  // At a point on or near a surface.
+  Vec3 irradiance(Vec3 p, Vec3 n) const {
+    return irradiance_.solve(p + 8 * kLift * largest_magnitude(p) * n, n);
+  }
 
  private:
   struct Path {
@@ -57,14 +58,24 @@ class Compositor {
   };
   struct Cones;  // the directions from a point to the objects' bounding spheres
 
+  void find_bounds();
   bool may_hit(Vec3 o, Vec3 d) const;
-  Hit meet_object(Vec3 o, Vec3 d, float tfar, Path& path) const;
+  // The first object that does not let the ray through; multiplies `share` by what comes through
+  // those that do, so that its mean is right.
+  Hit meet_object(Vec3 o, Vec3 d, float tfar, Vec3& share, Path& path) const;
   Place meet_stand_in(Vec3 o, Vec3 d, float tfar, Path& path) const;
 
+  // The first object or the first place of the set on a ray, whichever comes first.
+  struct Meeting {
+    Hit hit;
+    Place place;  // only where it comes before the object
+  };
+  Meeting meet(Vec3 o, Vec3 d, Vec3& share, Path& path) const;
+
   Vec3 object_radiance(Hit hit, Vec3 d, int bounces, Path& path) const;
-  Vec3 diffuse_light(const Surface& s, int bounces, Path& path) const;
+  Vec3 direct_light(const Surface& s, Vec3 wo, int bounces, Path& path) const;
   Vec3 stand_in_radiance(const Place& place, Vec3 d, int bounces, Path& path) const;
-  Vec3 change(Vec3 x, Vec3 d, float cos, const Hit& hit, const Place& behind, int bounces,
+  Vec3 change(Vec3 d, float cos, const Hit& hit, Vec3 share, const Place& behind, int bounces,
               Path& path) const;
   Vec3 light_change(Vec3 x, Vec3 n, const Cones& cones, float share, int bounces,
                     Path& path) const;
@@ -72,9 +83,8 @@ class Compositor {
                    Path& path) const;
   Vec3 relative_change(const Place& place, int bounces, bool both, Path& path) const;
 
-  const Mesh objects_;
-  const std::vector<Sphere> bounds_;
-  Accel accel_;
+  World* objects_;
+  std::vector<Sphere> bounds_;
   Captured captured_;
   Irradiance irradiance_;
   SampleTable table_;

@@ -17,7 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chromeball.renderer import core
-from chromeball.renderer.mesh import Mesh, Values
+from chromeball.renderer.mesh import Instance, Mesh, Values, affine
+from chromeball.renderer.world import world
+from chromeball.scene.errors import UserError
+from chromeball.scene.pose import Pose
 from chromeball.stand_in.ply import StandInMesh
 
 #: Channels of the film, as in the C++ core's `Film`.
@@ -34,8 +37,6 @@ _COVERAGE, _SUPPORT, _DEPTH, _SURFACES, _SQUARE, _BRIGHTNESS, _SAMPLES, _COUNT =
 )
 #: Samples of a pixel before its noise is known well enough to steer by.
 _PILOT = 8
-#: Bounding spheres that the core looks at one by one.
-_MOST_SPHERES = 32
 
 
 @dataclass(frozen=True)
@@ -45,11 +46,20 @@ class CapturedSet:
     ``environment`` (h, w, 3) float32 lat-long radiance, OpenEXR's axes in the world;
     ``origin`` (3,) the map's place in metres; ``stand_in`` triangles of the set. Without
     stand-in geometry all light is directional and there is nothing to cast shadows on.
+
+    Raises
+    ------
+    UserError
+        For an environment with pixels that are NaN, infinite or negative, and says how many.
+
     """
 
     environment: NDArray[np.float32]
     origin: NDArray[np.float64]
     stand_in: StandInMesh | None = None
+
+    def __post_init__(self) -> None:
+        check_environment(self.environment)
 
 
 @dataclass(frozen=True)
@@ -85,12 +95,14 @@ class Composite:
 class Compositor:
     """A progressive compositor: :meth:`add` samples, look at :meth:`result`, go on.
 
-    :meth:`look` starts over with another camera, :meth:`place` with other objects.
+    :meth:`look` starts over with another camera, :meth:`place` with other objects,
+    :meth:`move` with one object elsewhere.
 
     Parameters
     ----------
     objects
-        The synthetic objects; an empty list leaves the plate alone.
+        The synthetic objects: instances of meshes, or meshes that stand where their vertices
+        are; an empty list leaves the plate alone.
     captured
         The set's light and geometry.
     rays
@@ -113,7 +125,7 @@ class Compositor:
 
     def __init__(
         self,
-        objects: Sequence[Mesh],
+        objects: Sequence[Mesh | Instance],
         captured: CapturedSet,
         rays: NDArray[np.float32],
         camera: Values,
@@ -126,21 +138,16 @@ class Compositor:
         plate_samples: int = 16,
     ) -> None:
         self._difference = mode == "difference"
-        self._captured = captured
         self._environment = np.ascontiguousarray(captured.environment, np.float32)
-        self._options = bounces, seed, samples
         self._plate_samples = plate_samples
-        self._core = self._build(objects)
-        self.look(rays, camera, plate)
-
-    def _build(self, objects: Sequence[Mesh]) -> core.Compositor:
-        return core.Compositor(
-            Mesh.join(objects).core(),
-            _bounds(objects),
-            _core_stand_in(self._captured.stand_in),
+        self._core = core.Compositor(
+            world(objects),
+            _core_stand_in(captured.stand_in),
             self._environment,
-            _triple(self._captured.origin),
-            *self._options,
+            _triple(captured.origin),
+            bounces,
+            seed,
+            samples,
         )
 
     def look(
@@ -163,9 +170,18 @@ class Compositor:
         self._seen = corners[1:, 1:] & corners[1:, :-1] & corners[:-1, 1:] & corners[:-1, :-1]
         self._start()
 
-    def place(self, objects: Sequence[Mesh]) -> None:
-        """Start over with other objects; camera and plate stay."""
-        self._core = self._build(objects)
+    def place(self, objects: Sequence[Mesh | Instance]) -> None:
+        """Start over with other objects; camera, plate and captured set stay as they are."""
+        self._core.place(world(objects))
+        self._start()
+
+    def move(self, k: int, pose: Pose, scale: Values = 1.0) -> None:
+        """Start over with object `k` elsewhere; no mesh is built again.
+
+        `pose` and `scale` (one factor or three) apply to the mesh's vertices, as in
+        :class:`Instance`. Raises IndexError where there is no such object.
+        """
+        self._core.move(k, affine(pose, scale))
         self._start()
 
     def _start(self) -> None:
@@ -289,17 +305,21 @@ def _float32(values: NDArray[np.floating]) -> NDArray[np.float32]:
     return values.astype(np.float32, copy=False)
 
 
-def _bounds(objects: Sequence[Mesh]) -> NDArray[np.float32]:
-    """Bounding spheres (N, 4), centre and radius, a little large against rounding."""
-    clouds = [m.vertices[np.unique(m.faces)] for m in objects if len(m.faces)]
-    if len(clouds) > _MOST_SPHERES:
-        clouds = [np.concatenate(clouds)]
-    spheres = np.empty((len(clouds), 4), np.float32)
-    for sphere, points in zip(spheres, clouds, strict=True):
-        sphere[:3] = (points.min(axis=0) + points.max(axis=0)) / 2
-        radius = np.linalg.norm(points - sphere[:3], axis=1).max()
-        sphere[3] = radius * (1 + 1e-4) + 1e-6
-    return spheres
+def check_environment(environment: NDArray[np.float32]) -> None:
+    """Raise UserError unless this is a picture (h, w, 3) of light: finite and not negative."""
+    if environment.ndim != 3 or environment.shape[2] != 3 or not environment.size:
+        raise UserError(f"an environment of shape {environment.shape}: (h, w, 3) is needed")
+    bad = {
+        "NaN": np.isnan(environment),
+        "infinite": np.isinf(environment),
+        "negative": environment < 0,
+    }
+    found = [f"{n} {what}" for what, m in bad.items() if (n := int(m.any(axis=2).sum()))]
+    if found:
+        raise UserError(
+            f"the environment has {' and '.join(found)} pixels of {environment[..., 0].size}; "
+            "mend them before it can be light"
+        )
 
 
 def _core_stand_in(mesh: StandInMesh | None) -> core.StandIn:

@@ -3,9 +3,13 @@
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/array.h>
 #include <nanobind/stl/optional.h>
+#include <nanobind/stl/pair.h>
+
+#include <tbb/parallel_for.h>
 
 #include "composite.h"
 #include "path.h"
+#include "world.h"
 
 namespace nb = nanobind;
 using namespace chromeball;
@@ -14,10 +18,12 @@ namespace {
 
 using In3f = nb::ndarray<const float, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
 using In3u = nb::ndarray<const uint32_t, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
-using In4f = nb::ndarray<const float, nb::shape<-1, 4>, nb::c_contig, nb::device::cpu>;
-using In1f = nb::ndarray<const float, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
+using In2f = nb::ndarray<const float, nb::shape<-1, 2>, nb::c_contig, nb::device::cpu>;
+using In1u = nb::ndarray<const uint32_t, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
+using Matrix = nb::ndarray<const double, nb::shape<3, 4>, nb::c_contig, nb::device::cpu>;
 using In1b = nb::ndarray<const uint8_t, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
 using Picture = nb::ndarray<const float, nb::shape<-1, -1, 3>, nb::c_contig, nb::device::cpu>;
+using Pixels = nb::ndarray<const float, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
 using Counts = nb::ndarray<const uint16_t, nb::shape<-1, -1>, nb::c_contig, nb::device::cpu>;
 using InOut = nb::ndarray<float, nb::shape<-1, -1, Film::kCount>, nb::c_contig, nb::device::cpu>;
 using Out = nb::ndarray<nb::numpy, float, nb::ndim<3>>;
@@ -39,19 +45,46 @@ struct NewPicture {
   }
 };
 
-// The faces with their materials; indices are checked by the Python side.
-struct MeshArrays {
-  In3f vertices;
-  std::optional<In3f> normals;
-  In3u faces;
-  In3f albedo, emission;
-  In1b kind;
-  In1f ior;
-
-  Mesh mesh() const {
-    return {view(vertices), normals ? view(*normals) : std::span<const float>(), view(faces),
-            view(albedo), view(emission), view(kind), view(ior)};
+void check_faces(const In3u& faces, size_t vertices) {
+  for (const uint32_t i : view(faces)) {
+    if (i >= vertices) throw nb::value_error("face index out of range");
   }
+}
+
+// A world and the arrays that it looks at; indices are checked by the Python side.
+class WorldArrays {
+ public:
+  World world;
+
+  uint32_t add_texture(Pixels pixels, std::array<uint8_t, 2> wrap) {
+    pixels_.push_back(pixels);
+    return world.add(Texture{view(pixels), int(pixels.shape(0)), int(pixels.shape(1)),
+                             int(pixels.shape(2)), {Wrap(wrap[0]), Wrap(wrap[1])}});
+  }
+  uint32_t add_mesh(In3f vertices, std::optional<In3f> normals, std::optional<In2f> uv,
+                    In3u faces, In1u material) {
+    const size_t v = vertices.shape(0);
+    if ((normals && normals->shape(0) != v) || (uv && uv->shape(0) != v) ||
+        material.shape(0) != faces.shape(0)) {
+      throw nb::value_error("arrays of one mesh differ in length");
+    }
+    check_faces(faces, v);
+    meshes_.push_back({normals, uv, material});
+    const nb::gil_scoped_release release;
+    return world.add(MeshView{view(vertices),
+                              normals ? view(*normals) : std::span<const float>(),
+                              uv ? view(*uv) : std::span<const float>(), view(faces),
+                              view(material)});
+  }
+
+ private:
+  struct MeshArrays {
+    std::optional<In3f> normals;
+    std::optional<In2f> uv;
+    In1u material;
+  };
+  std::vector<Pixels> pixels_;
+  std::vector<MeshArrays> meshes_;
 };
 
 struct StandInArrays {
@@ -64,32 +97,28 @@ struct StandInArrays {
   }
 };
 
-void check_faces(const In3u& faces, size_t vertices) {
-  for (const uint32_t i : view(faces)) {
-    if (i >= vertices) throw nb::value_error("face index out of range");
-  }
-}
-
 // The compositor with all that it looks at.
 class CompositorArrays {
  public:
-  CompositorArrays(MeshArrays objects, In4f bounds, StandInArrays stand_in, Picture environment,
+  CompositorArrays(nb::object objects, StandInArrays stand_in, Picture environment,
                    std::array<float, 3> origin, int bounces, uint64_t seed, uint32_t samples)
-      : objects_(std::move(objects)), stand_in_(std::move(stand_in)) {
-    std::vector<Sphere> spheres;
-    for (size_t i = 0; i < bounds.shape(0); ++i) {
-      spheres.push_back({Vec3(bounds.data() + 4 * i), bounds.data()[4 * i + 3]});
-    }
+      : objects_(objects), stand_in_(std::move(stand_in)) {
+    World& world = nb::cast<WorldArrays&>(objects_).world;
     nb::gil_scoped_release release;
     environment_.emplace(environment.data(), int(environment.shape(0)),
                          int(environment.shape(1)));
-    compositor_.emplace(objects_.mesh(), std::move(spheres), stand_in_.stand_in(),
-                        *environment_, Vec3(origin.data()), bounces, seed, samples);
+    compositor_.emplace(world, stand_in_.stand_in(), *environment_,
+                        Vec3(origin.data()), bounces, seed, samples);
   }
+  void place(nb::object objects) {
+    compositor_->place(nb::cast<WorldArrays&>(objects).world);
+    objects_ = std::move(objects);
+  }
+  Compositor* operator->() { return &*compositor_; }
   const Compositor* operator->() const { return &*compositor_; }
 
  private:
-  MeshArrays objects_;
+  nb::object objects_;  // a WorldArrays
   StandInArrays stand_in_;
   std::optional<Environment> environment_;
   std::optional<Compositor> compositor_;
@@ -99,32 +128,79 @@ PixelRays pixel_rays(const Picture& corners) {
   return {corners.data(), int(corners.shape(0)) - 1, int(corners.shape(1)) - 1};
 }
 
+// The first hit of each ray: distance (inf: none), place, normal of the face on the ray's side,
+// shading normal, where a ray that goes on starts, instance and face: (N, 1, 15).
+Out hits(const WorldArrays& self, In3f origins, In3f directions) {
+  if (origins.shape(0) != directions.shape(0)) {
+    throw nb::value_error("origins and directions differ in length");
+  }
+  NewPicture out(origins.shape(0), 1, 15);
+  {
+    const nb::gil_scoped_release release;
+    const auto range = tbb::blocked_range<size_t>(0, out.height, 256);
+    tbb::parallel_for(range, [&](const auto& piece) {
+      const FlushDenormals flush;
+      for (size_t i = piece.begin(); i < piece.end(); ++i) {
+        const Vec3 o(origins.data() + 3 * i), d(directions.data() + 3 * i);
+        float* to = out.data + out.channels * i;
+        const Hit hit = self.world.intersect(o, d);
+        to[0] = hit.t;
+        if (!hit) continue;
+        const Surface s = self.world.surface_at(hit, d);
+        const Vec3 rows[] = {s.p, s.ng, s.ns, s.start(s.ng)};
+        for (int k = 0; k < 12; ++k) to[1 + k] = (&rows[k / 3].x)[k % 3];
+        to[13] = float(hit.instance), to[14] = float(hit.face);
+      }
+    });
+  }
+  return out.release();
+}
+
 }  // namespace
 
 NB_MODULE(core, m) {
-  nb::class_<MeshArrays>(m, "Mesh")
-      .def("__init__",
-           [](MeshArrays* self, In3f vertices, std::optional<In3f> normals, In3u faces,
-              In3f albedo, In3f emission, In1b kind, In1f ior) {
-             const size_t f = faces.shape(0);
-             if (albedo.shape(0) != f || emission.shape(0) != f || kind.shape(0) != f ||
-                 ior.shape(0) != f || (normals && normals->shape(0) != vertices.shape(0))) {
-               throw nb::value_error("arrays of one mesh differ in length");
-             }
-             check_faces(faces, vertices.shape(0));
-             new (self) MeshArrays{vertices, normals, faces, albedo, emission, kind, ior};
-           },
-           nb::arg("vertices"), nb::arg("normals").none(), nb::arg("faces"), nb::arg("albedo"),
-           nb::arg("emission"), nb::arg("kind"), nb::arg("ior"));
+  nb::class_<WorldArrays>(m, "World")
+      .def(nb::init<>())
+      .def("add_texture", &WorldArrays::add_texture, nb::arg("pixels"), nb::arg("wrap"))
+      .def(
+          "add_material",
+          [](WorldArrays& self, std::array<float, 3> base, float metallic, float roughness,
+             float specular, float ior, float transmission, bool thin, float clearcoat,
+             float clearcoat_roughness, std::array<float, 3> emission, float alpha,
+             uint8_t alpha_mode, float alpha_cutoff, float normal_scale,
+             std::array<int32_t, 4> textures) {
+            Material m{};
+            m.base = Vec3(base.data()), m.metallic = metallic, m.roughness = roughness;
+            m.specular = specular, m.ior = ior, m.transmission = transmission, m.thin = thin;
+            m.clearcoat = clearcoat, m.clearcoat_roughness = clearcoat_roughness;
+            m.emission = Vec3(emission.data());
+            m.alpha = alpha, m.alpha_mode = AlphaMode(alpha_mode);
+            m.alpha_cutoff = alpha_cutoff, m.normal_scale = normal_scale;
+            m.base_texture = textures[0], m.metallic_roughness_texture = textures[1];
+            m.normal_texture = textures[2], m.emission_texture = textures[3];
+            return self.world.add(m);
+          },
+          nb::kw_only(), nb::arg("base"), nb::arg("metallic"), nb::arg("roughness"),
+          nb::arg("specular"), nb::arg("ior"), nb::arg("transmission"), nb::arg("thin"),
+          nb::arg("clearcoat"), nb::arg("clearcoat_roughness"), nb::arg("emission"),
+          nb::arg("alpha"), nb::arg("alpha_mode"), nb::arg("alpha_cutoff"),
+          nb::arg("normal_scale"), nb::arg("textures"))
+      .def("add_mesh", &WorldArrays::add_mesh, nb::arg("vertices"), nb::arg("normals").none(),
+           nb::arg("uv").none(), nb::arg("faces"), nb::arg("material"))
+      .def(
+          "place",
+          [](WorldArrays& self, uint32_t mesh, Matrix matrix) {
+            return self.world.place(mesh, matrix.data());
+          },
+          nb::arg("mesh"), nb::arg("matrix"))
+      .def("commit", [](WorldArrays& self) { self.world.commit(); })
+      .def("hits", &hits, nb::arg("origins"), nb::arg("directions"));
 
   m.def(
       "path_trace",
-      [](const MeshArrays& arrays, Picture corners, std::array<float, 3> origin, int spp,
+      [](const WorldArrays& arrays, Picture corners, std::array<float, 3> origin, int spp,
          uint64_t seed, int bounces, std::optional<Picture> environment,
          std::optional<In3f> irradiance, float gather_from) {
-        if (irradiance && irradiance->shape(0) != arrays.vertices.shape(0)) {
-          throw nb::value_error("irradiance and vertices differ in length");
-        }
         const PixelRays rays = pixel_rays(corners);
         NewPicture out(rays.height, rays.width, 3);
         {
@@ -134,19 +210,19 @@ NB_MODULE(core, m) {
             light.emplace(environment->data(), int(environment->shape(0)),
                           int(environment->shape(1)));
           }
-          path_trace(arrays.mesh(), rays, Vec3(origin.data()), spp, seed, bounces,
+          path_trace(arrays.world, rays, Vec3(origin.data()), spp, seed, bounces,
                      light ? &*light : nullptr, irradiance ? irradiance->data() : nullptr,
                      gather_from, out.data);
         }
         return out.release();
       },
-      nb::arg("mesh"), nb::arg("corners"), nb::arg("origin"), nb::arg("spp"), nb::arg("seed"),
+      nb::arg("world"), nb::arg("corners"), nb::arg("origin"), nb::arg("spp"), nb::arg("seed"),
       nb::arg("bounces"), nb::arg("environment").none(), nb::arg("irradiance").none(),
       nb::arg("gather_from"));
 
   m.def(
       "irradiance",
-      [](const MeshArrays& arrays, In3f points, In3f normals, int spp, uint64_t seed,
+      [](const WorldArrays& arrays, In3f points, In3f normals, int spp, uint64_t seed,
          int bounces) {
         if (points.shape(0) != normals.shape(0)) {
           throw nb::value_error("points and normals differ in length");
@@ -154,12 +230,12 @@ NB_MODULE(core, m) {
         NewPicture out(points.shape(0), 1, 3);
         {
           nb::gil_scoped_release release;
-          irradiance(arrays.mesh(), points.data(), normals.data(), points.shape(0), spp, seed,
+          irradiance(arrays.world, points.data(), normals.data(), points.shape(0), spp, seed,
                      bounces, nullptr, out.data);
         }
         return out.release();
       },
-      nb::arg("mesh"), nb::arg("points"), nb::arg("normals"), nb::arg("spp"), nb::arg("seed"),
+      nb::arg("world"), nb::arg("points"), nb::arg("normals"), nb::arg("spp"), nb::arg("seed"),
       nb::arg("bounces"));
 
   nb::class_<StandInArrays>(m, "StandIn")
@@ -174,10 +250,18 @@ NB_MODULE(core, m) {
            nb::arg("vertices"), nb::arg("original"), nb::arg("faces"), nb::arg("surface"));
 
   nb::class_<CompositorArrays>(m, "Compositor")
-      .def(nb::init<MeshArrays, In4f, StandInArrays, Picture, std::array<float, 3>, int,
-                    uint64_t, uint32_t>(),
-           nb::arg("objects"), nb::arg("bounds"), nb::arg("stand_in"), nb::arg("environment"),
-           nb::arg("origin"), nb::arg("bounces"), nb::arg("seed"), nb::arg("samples"))
+      .def(nb::init<nb::object, StandInArrays, Picture, std::array<float, 3>, int, uint64_t,
+                    uint32_t>(),
+           nb::arg("objects"), nb::arg("stand_in"),
+           nb::arg("environment"), nb::arg("origin"), nb::arg("bounces"), nb::arg("seed"),
+           nb::arg("samples"))
+      .def("place", &CompositorArrays::place, nb::arg("objects"))
+      .def(
+          "move",
+          [](CompositorArrays& self, uint32_t object, Matrix matrix) {
+            self->move(object, matrix.data());
+          },
+          nb::arg("object"), nb::arg("matrix"))
       .def(
           "add",
           [](const CompositorArrays& self, Picture corners, std::array<float, 3> camera,

@@ -1,20 +1,44 @@
-from numpy import float32, uint8, uint16, uint32
+from numpy import float32, float64, uint8, uint16, uint32
 from numpy.typing import NDArray
 
-class Mesh:
-    def __init__(
+class World:
+    def __init__(self) -> None: ...
+    def add_texture(self, pixels: NDArray[float32], wrap: tuple[int, int]) -> int: ...
+    def add_material(
+        self,
+        *,
+        base: tuple[float, float, float],
+        metallic: float,
+        roughness: float,
+        specular: float,
+        ior: float,
+        transmission: float,
+        thin: bool,
+        clearcoat: float,
+        clearcoat_roughness: float,
+        emission: tuple[float, float, float],
+        alpha: float,
+        alpha_mode: int,
+        alpha_cutoff: float,
+        normal_scale: float,
+        textures: tuple[int, int, int, int],
+    ) -> int: ...
+    def add_mesh(
         self,
         vertices: NDArray[float32],
         normals: NDArray[float32] | None,
+        uv: NDArray[float32] | None,
         faces: NDArray[uint32],
-        albedo: NDArray[float32],
-        emission: NDArray[float32],
-        kind: NDArray[uint8],
-        ior: NDArray[float32],
-    ) -> None: ...
+        material: NDArray[uint32],
+    ) -> int: ...
+    def place(self, mesh: int, matrix: NDArray[float64]) -> int: ...
+    def commit(self) -> None: ...
+    def hits(
+        self, origins: NDArray[float32], directions: NDArray[float32]
+    ) -> NDArray[float32]: ...
 
 def path_trace(
-    mesh: Mesh,
+    world: World,
     corners: NDArray[float32],
     origin: tuple[float, float, float],
     spp: int,
@@ -25,7 +49,7 @@ def path_trace(
     gather_from: float,
 ) -> NDArray[float32]: ...
 def irradiance(
-    mesh: Mesh,
+    world: World,
     points: NDArray[float32],
     normals: NDArray[float32],
     spp: int,
@@ -45,8 +69,7 @@ class StandIn:
 class Compositor:
     def __init__(
         self,
-        objects: Mesh,
-        bounds: NDArray[float32],
+        objects: World,
         stand_in: StandIn,
         environment: NDArray[float32],
         origin: tuple[float, float, float],
@@ -54,6 +77,8 @@ class Compositor:
         seed: int,
         samples: int,
     ) -> None: ...
+    def place(self, objects: World) -> None: ...
+    def move(self, object: int, matrix: NDArray[float64]) -> None: ...
     def add(
         self,
         corners: NDArray[float32],

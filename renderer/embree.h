@@ -24,11 +24,10 @@ constexpr float kInfinity = std::numeric_limits<float>::infinity();
 
 struct Hit {
   float t = kInfinity;
-  Vec3 ng;  // not normalised, right-handed around the face's corners
   float u = 0, v = 0;
   uint32_t face = RTC_INVALID_GEOMETRY_ID;
-  uint32_t mesh = RTC_INVALID_GEOMETRY_ID;
-  explicit operator bool() const { return mesh != RTC_INVALID_GEOMETRY_ID; }
+  uint32_t instance = RTC_INVALID_GEOMETRY_ID;  // of a scene without instances: the geometry
+  explicit operator bool() const { return instance != RTC_INVALID_GEOMETRY_ID; }
 };
 
 // Denormal floats cost Embree dearly; every worker sets this for its piece of work.
@@ -46,96 +45,144 @@ class FlushDenormals {
   unsigned saved_;
 };
 
-class Accel {
+// Owners of Embree's handles.
+struct Release {
+  void operator()(RTCDevice d) const { rtcReleaseDevice(d); }
+  void operator()(RTCScene s) const { rtcReleaseScene(s); }
+  void operator()(RTCGeometry g) const { rtcReleaseGeometry(g); }
+};
+using SceneHandle = std::unique_ptr<RTCSceneTy, Release>;
+using GeometryHandle = std::unique_ptr<RTCGeometryTy, Release>;
+
+class Device {
  public:
-  Accel() : device_(rtcNewDevice(nullptr)) {
+  Device() : device_(rtcNewDevice(nullptr)) {
     if (!device_) throw std::runtime_error("Embree: no device");
     rtcSetDeviceErrorFunction(
         device_.get(),
-        [](void* self, RTCError, const char* text) { static_cast<Accel*>(self)->error_ = text; },
+        [](void* self, RTCError, const char* text) { static_cast<Device*>(self)->error_ = text; },
         this);
-    scene_.reset(rtcNewScene(device_.get()));
-    rtcSetSceneFlags(scene_.get(), RTC_SCENE_FLAG_ROBUST);
-    rtcSetSceneBuildQuality(scene_.get(), RTC_BUILD_QUALITY_HIGH);
   }
-  Accel(const Accel&) = delete;
-  Accel& operator=(const Accel&) = delete;
+  Device(const Device&) = delete;
+  Device& operator=(const Device&) = delete;
 
-  // Copies V vertices and F faces; returns the mesh's number.
-  uint32_t add(const float* vertices, size_t v, const uint32_t* faces, size_t f) {
-    RTCGeometry g = rtcNewGeometry(device_.get(), RTC_GEOMETRY_TYPE_TRIANGLE);
-    auto* to_v = static_cast<float*>(rtcSetNewGeometryBuffer(
-        g, RTC_BUFFER_TYPE_VERTEX, 0, RTC_FORMAT_FLOAT3, 3 * sizeof(float), v));
-    auto* to_f = static_cast<uint32_t*>(rtcSetNewGeometryBuffer(
-        g, RTC_BUFFER_TYPE_INDEX, 0, RTC_FORMAT_UINT3, 3 * sizeof(uint32_t), f));
-    if (!to_v || !to_f) throw std::runtime_error("Embree: " + error_);
-    std::copy(vertices, vertices + 3 * v, to_v);
-    std::copy(faces, faces + 3 * f, to_f);
-    rtcCommitGeometry(g);
-    const uint32_t id = rtcAttachGeometry(scene_.get(), g);
-    rtcReleaseGeometry(g);
-    empty_ = false;
-    return id;
-  }
-
-  void commit() {
-    rtcCommitScene(scene_.get());
+  RTCDevice get() const { return device_.get(); }
+  void check() const {
     if (!error_.empty()) throw std::runtime_error("Embree: " + error_);
   }
-
-  bool empty() const { return empty_; }
-
-  Hit intersect(Vec3 o, Vec3 d, float tfar = kInfinity) const {
-    RTCRayHit r;
-    r.ray = ray(o, d, tfar);
-    r.hit.geomID = RTC_INVALID_GEOMETRY_ID;
-    r.hit.primID = RTC_INVALID_GEOMETRY_ID;
-    r.hit.instID[0] = RTC_INVALID_GEOMETRY_ID;
-#if CHROMEBALL_EMBREE >= 4
-    rtcIntersect1(scene_.get(), &r);
-#else
-    RTCIntersectContext context;
-    rtcInitIntersectContext(&context);
-    rtcIntersect1(scene_.get(), &context, &r);
-#endif
-    return {r.ray.tfar, {r.hit.Ng_x, r.hit.Ng_y, r.hit.Ng_z}, r.hit.u, r.hit.v,
-            r.hit.primID, r.hit.geomID};
-  }
-
-  bool occluded(Vec3 o, Vec3 d, float tfar = kInfinity) const {
-    RTCRay r = ray(o, d, tfar);
-#if CHROMEBALL_EMBREE >= 4
-    rtcOccluded1(scene_.get(), &r);
-#else
-    RTCIntersectContext context;
-    rtcInitIntersectContext(&context);
-    rtcOccluded1(scene_.get(), &context, &r);
-#endif
-    return r.tfar < 0;
+  SceneHandle scene(RTCBuildQuality quality) const {
+    SceneHandle scene(rtcNewScene(device_.get()));
+    rtcSetSceneFlags(scene.get(), RTC_SCENE_FLAG_ROBUST);
+    rtcSetSceneBuildQuality(scene.get(), quality);
+    return scene;
   }
 
  private:
-  static RTCRay ray(Vec3 o, Vec3 d, float tfar) {
-    RTCRay r;
-    r.org_x = o.x, r.org_y = o.y, r.org_z = o.z;
-    r.dir_x = d.x, r.dir_y = d.y, r.dir_z = d.z;
-    r.tnear = 0, r.tfar = tfar, r.time = 0, r.mask = ~0u, r.id = 0, r.flags = 0;
-    return r;
-  }
-
-  struct Release {
-    void operator()(RTCDevice d) const { rtcReleaseDevice(d); }
-    void operator()(RTCScene s) const { rtcReleaseScene(s); }
-  };
   std::string error_;  // first, so that it outlives the device that reports into it
   std::unique_ptr<RTCDeviceTy, Release> device_;
-  std::unique_ptr<RTCSceneTy, Release> scene_;
+};
+
+// Triangles in Embree's own buffers: v vertices and f faces, copied.
+struct Triangles {
+  const float* vertices = nullptr;
+  const uint32_t* faces = nullptr;
+  size_t size = 0;
+
+  Vec3 corner(uint32_t face, int k) const { return Vec3(vertices + 3 * faces[3 * face + k]); }
+};
+
+inline Triangles attach_triangles(const Device& device, RTCScene scene, const float* vertices,
+                                  size_t v, const uint32_t* faces, size_t f) {
+  const GeometryHandle g(rtcNewGeometry(device.get(), RTC_GEOMETRY_TYPE_TRIANGLE));
+  auto* to_v = static_cast<float*>(rtcSetNewGeometryBuffer(
+      g.get(), RTC_BUFFER_TYPE_VERTEX, 0, RTC_FORMAT_FLOAT3, 3 * sizeof(float), v));
+  auto* to_f = static_cast<uint32_t*>(rtcSetNewGeometryBuffer(
+      g.get(), RTC_BUFFER_TYPE_INDEX, 0, RTC_FORMAT_UINT3, 3 * sizeof(uint32_t), f));
+  device.check();
+  std::copy(vertices, vertices + 3 * v, to_v);
+  std::copy(faces, faces + 3 * f, to_f);
+  rtcCommitGeometry(g.get());
+  rtcAttachGeometry(scene, g.get());
+  return {to_v, to_f, f};
+}
+
+inline RTCRay make_ray(Vec3 o, Vec3 d, float tfar) {
+  RTCRay r;
+  r.org_x = o.x, r.org_y = o.y, r.org_z = o.z;
+  r.dir_x = d.x, r.dir_y = d.y, r.dir_z = d.z;
+  r.tnear = 0, r.tfar = tfar, r.time = 0, r.mask = ~0u, r.id = 0, r.flags = 0;
+  return r;
+}
+
+inline Hit intersect(RTCScene scene, Vec3 o, Vec3 d, float tfar) {
+  RTCRayHit r;
+  r.ray = make_ray(o, d, tfar);
+  r.hit.geomID = RTC_INVALID_GEOMETRY_ID;
+  r.hit.primID = RTC_INVALID_GEOMETRY_ID;
+  r.hit.instID[0] = RTC_INVALID_GEOMETRY_ID;
+#if CHROMEBALL_EMBREE >= 4
+  rtcIntersect1(scene, &r);
+#else
+  RTCIntersectContext context;
+  rtcInitIntersectContext(&context);
+  rtcIntersect1(scene, &context, &r);
+#endif
+  const uint32_t in = r.hit.instID[0];
+  return {r.ray.tfar, r.hit.u, r.hit.v, r.hit.primID,
+          in != RTC_INVALID_GEOMETRY_ID ? in : r.hit.geomID};
+}
+
+inline bool occluded(RTCScene scene, Vec3 o, Vec3 d, float tfar) {
+  RTCRay r = make_ray(o, d, tfar);
+#if CHROMEBALL_EMBREE >= 4
+  rtcOccluded1(scene, &r);
+#else
+  RTCIntersectContext context;
+  rtcInitIntersectContext(&context);
+  rtcOccluded1(scene, &context, &r);
+#endif
+  return r.tfar < 0;
+}
+
+// One level of triangles.
+class Accel {
+ public:
+  Accel() : scene_(device_.scene(RTC_BUILD_QUALITY_HIGH)) {}
+
+  // Copies V vertices and F faces.
+  Triangles add(const float* vertices, size_t v, const uint32_t* faces, size_t f) {
+    empty_ = false;
+    return attach_triangles(device_, scene_.get(), vertices, v, faces, f);
+  }
+  void commit() {
+    rtcCommitScene(scene_.get());
+    device_.check();
+  }
+  bool empty() const { return empty_; }
+  RTCScene scene() const { return scene_.get(); }
+
+  Hit intersect(Vec3 o, Vec3 d, float tfar = kInfinity) const {
+    return chromeball::intersect(scene_.get(), o, d, tfar);
+  }
+  bool occluded(Vec3 o, Vec3 d, float tfar = kInfinity) const {
+    return chromeball::occluded(scene_.get(), o, d, tfar);
+  }
+
+ private:
+  Device device_;
+  SceneHandle scene_;
   bool empty_ = true;
 };
 
-// A ray's start, lifted off the surface to the side n points to, against rounding.
-inline Vec3 lift(Vec3 p, Vec3 n) {
-  return p + n * (1e-5f * largest_magnitude(p) + 1e-5f);
-}
+// Half the spacing of floats at 1, and Higham's bound of the error of n roundings.
+constexpr float kHalfUlp = 0x1p-24f;
+constexpr float gamma(int n) { return n * kHalfUlp / (1 - n * kHalfUlp); }
+// Roundings between a hit and the next ray that must clear its face: the hit is interpolated,
+// moved, lifted, taken back into the mesh's space by Embree and subtracted from the corners.
+constexpr float kLift = gamma(16);
+
+// How far from a face with normal n a ray has to start that leaves p, which was interpolated
+// from corners of absolute sizes up to `size` (Pharr, Jakob, Humphreys 2016, section 3.9).
+inline float rise(Vec3 size, Vec3 n) { return kLift * dot(abs(n), size) + 1e-30f; }
 
 }  // namespace chromeball

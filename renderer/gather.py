@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from chromeball.renderer import core
 from chromeball.renderer.mesh import Mesh
 from chromeball.renderer.path import path_trace
+from chromeball.renderer.world import world
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,7 @@ def light_set(
         normal[divided.faces] = face_normal[:, None]
         n = normal[lit] / np.linalg.norm(normal[lit], axis=1, keepdims=True)
         irradiance[lit] = core.irradiance(
-            mesh.core(),
+            world([mesh]),
             inward[lit],
             np.ascontiguousarray(n, np.float32),
             spp,
@@ -119,18 +120,19 @@ def tessellate(mesh: Mesh, edge: float) -> tuple[Mesh, NDArray[np.bool_], NDArra
         count += int(keep.sum())
     parent = np.concatenate(parents)
     everything = np.concatenate(vertices)
+    def grown(values: NDArray[np.float32] | None) -> NDArray[np.float32] | None:
+        if values is None:
+            return None
+        more = np.zeros((count - len(values), values.shape[1]), np.float32)
+        return np.concatenate([values, more])
+
     divided = Mesh(
         everything.astype(np.float32),
         np.concatenate(faces).astype(np.uint32),
-        mesh.albedo[parent],
-        mesh.emission[parent],
-        mesh.kind[parent],
-        mesh.ior[parent],
-        None
-        if mesh.normals is None
-        else np.concatenate(
-            [mesh.normals, np.zeros((count - len(mesh.normals), 3), np.float32)]
-        ),
+        mesh.material[parent],
+        mesh.materials,
+        grown(mesh.normals),
+        grown(mesh.uv),
     )
     lit = np.arange(count) >= len(mesh.vertices)
     return divided, lit, np.concatenate(inward).astype(np.float32)

@@ -8,6 +8,14 @@ namespace chromeball {
 Irradiance::Irradiance(const Captured& captured, uint64_t seed)
     : captured_(captured), table_(kSamples, seed ^ 0x49727261u) {
   const StandIn& stand_in = captured.stand_in();
+  Vec3 least(kInfinity), most(-kInfinity);
+  for (size_t i = 0; i < stand_in.vertices.size(); i += 3) {
+    const Vec3 p(&stand_in.vertices[i]);
+    least = {std::min(least.x, p.x), std::min(least.y, p.y), std::min(least.z, p.z)};
+    most = {std::max(most.x, p.x), std::max(most.y, p.y), std::max(most.z, p.z)};
+  }
+  const Vec3 middle = 0.5f * least + 0.5f * most;
+  const float extent = stand_in.vertices.empty() ? 1 : std::max(length(most - least), 1e-30f);
   // faces of one plane share a lattice: rounded normal and offset
   std::map<std::tuple<long, long, long, long>, uint32_t> known;
   std::vector<std::vector<uint32_t>> members;
@@ -15,23 +23,17 @@ Irradiance::Irradiance(const Captured& captured, uint64_t seed)
   for (uint32_t f = 0; f < stand_in.size(); ++f) {
     if (stand_in.surface[f] != 0) continue;
     const Vec3 a = stand_in.corner(f, 0);
-    const Vec3 n =
-        normalize(cross(stand_in.corner(f, 1) - a, stand_in.corner(f, 2) - a));
+    const Vec3 n = stand_in.normal(f);
+    const float offset = dot(n, a - middle) / extent;
     const auto key = std::tuple(std::lround(n.x * 1e3f), std::lround(n.y * 1e3f),
-                                std::lround(n.z * 1e3f), std::lround(dot(n, a) * 1e3f));
+                                std::lround(n.z * 1e3f), std::lround(offset * 4e3f));
     const auto [entry, fresh] = known.try_emplace(key, uint32_t(normals_.size()));
     if (fresh) normals_.push_back(n), members.emplace_back();
     group_[f] = entry->second;
     members[entry->second].push_back(f);
   }
-  Vec3 least(kInfinity), most(-kInfinity);
-  for (size_t i = 0; i < stand_in.vertices.size(); i += 3) {
-    const Vec3 p(&stand_in.vertices[i]);
-    least = {std::min(least.x, p.x), std::min(least.y, p.y), std::min(least.z, p.z)};
-    most = {std::max(most.x, p.x), std::max(most.y, p.y), std::max(most.z, p.z)};
-  }
   // many small planes (a scanned surface) need no lattice as fine as one large floor
-  const float finest = members.empty() ? 0 : length(most - least) / (2 * kCells);
+  const float finest = members.empty() ? 0 : extent / (2 * kCells);
   for (size_t g = 0; g < members.size(); ++g) {
     const Frame frame(normals_[g]);
     float low[2] = {kInfinity, kInfinity}, high[2] = {-kInfinity, -kInfinity};
@@ -48,13 +50,14 @@ Irradiance::Irradiance(const Captured& captured, uint64_t seed)
     const float a = high[0] - low[0], b = high[1] - low[1];
     // over one plane and nothing else the light is infinitely far, the irradiance even
     const int cells = members[g].size() == stand_in.size() ? 1 : kCells;
-    const float step = std::max({std::hypot(a, b) / cells, finest, 1e-6f});
+    const float step = std::max({std::hypot(a, b) / cells, finest, 1e-6f * extent});
     const float offset = dot(stand_in.corner(members[g][0], 0), frame.n);
     for (const float side : {1.0f, -1.0f}) {
       Lattice lattice;
       lattice.corner = low[0] * frame.s + low[1] * frame.t + offset * frame.n;
       lattice.s = frame.s, lattice.t = frame.t, lattice.n = side * frame.n;
       lattice.step = step;
+      lattice.rise = 8 * kLift * (largest_magnitude(middle) + extent);
       lattice.width = int(a / step) + 2, lattice.height = int(b / step) + 2;
       const size_t count = size_t(lattice.width) * lattice.height;
       lattice.nodes = std::make_unique<Node[]>(count);
@@ -64,8 +67,7 @@ Irradiance::Irradiance(const Captured& captured, uint64_t seed)
   }
 }
 
-Vec3 Irradiance::solve(Vec3 p, Vec3 n) const {
-  const Vec3 x = lift(p, n);
+Vec3 Irradiance::solve(Vec3 x, Vec3 n) const {
   const Frame frame(n);
   Vec3 sum;
   for (uint32_t i = 0; i < kSamples; ++i) {
@@ -129,7 +131,7 @@ Vec3 Irradiance::at(const Place& place) const {
   const float a = std::clamp(u - i, 0.0f, 1.0f), b = std::clamp(v - j, 0.0f, 1.0f);
   // in a cell that is cut, a node behind the wall or inside a box has no say
   const bool open = is_open(lattice, i, j);
-  const Vec3 x = lift(place.p, place.n);
+  const Vec3 x = place.start();
   Vec3 sum;
   float weights = 0;
   for (int k = 0; k < 4; ++k) {
@@ -140,7 +142,7 @@ Vec3 Irradiance::at(const Place& place) const {
     sum += weight * node(lattice, i + di, j + dj);
     weights += weight;
   }
-  return weights > 0 ? sum * (1 / weights) : solve(place.p, place.n);
+  return weights > 0 ? sum * (1 / weights) : solve(x, place.n);
 }
 
 }  // namespace chromeball

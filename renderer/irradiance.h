@@ -16,8 +16,8 @@ class Irradiance {
 
   // At a support place; n is its normal on the side that is lit.
   Vec3 at(const Place& place) const;
-  // The same without the lattice.
-  Vec3 solve(Vec3 p, Vec3 n) const;
+  // The same without the lattice; a ray may start at x.
+  Vec3 solve(Vec3 x, Vec3 n) const;
 
  private:
   static constexpr uint32_t kSamples = 256;  // of each of the two strategies
@@ -29,13 +29,13 @@ class Irradiance {
   };
   struct Lattice {  // on one side of one plane
     Vec3 corner, s, t, n;  // node (i, j) lies at corner + step (i s + j t)
-    float step;
+    float step, rise;
     int width, height;
     std::unique_ptr<Node[]> nodes;
     std::unique_ptr<std::atomic<uint8_t>[]> cells;  // 0 unknown, 1 open, 2 cut by a wall
 
     Vec3 node_place(int i, int j) const {
-      return lift(corner + step * (float(i) * s + float(j) * t), n);
+      return corner + step * (float(i) * s + float(j) * t) + rise * n;
     }
   };
   bool is_open(const Lattice& lattice, int i, int j) const;

@@ -39,7 +39,8 @@ class Material:
 
     ``transmission`` of 1 is glass: smooth where ``roughness`` is 0, a sheet without refraction
     where ``thin``. A mirror is ``metallic`` 1, ``roughness`` 0. ``specular`` scales the
-    reflectance of a dielectric that follows from ``ior``; 0 is a purely diffuse surface.
+    reflectance of a dielectric that follows from ``ior``, and is what any surface reflects at
+    grazing angles; 0 is a purely diffuse surface, or a metal alike at all angles.
     ``alpha_mode`` as in glTF: ``mask`` cuts at ``alpha_cutoff``, ``blend`` lets the share
     1 - alpha of the light straight through. ``metallic_roughness_texture``: roughness in
     channel 1, metallic in channel 2. ``normal_texture``: tangent space, 0..1.
@@ -92,7 +93,7 @@ class Material:
     @classmethod
     def mirror(cls, color: Color) -> Material:
         """A perfect mirror of the given reflectance."""
-        return cls(color, metallic=1.0, roughness=0.0)
+        return cls(color, metallic=1.0, roughness=0.0, specular=0.0)
 
     @classmethod
     def glass(cls, color: Color, ior: float = 1.5) -> Material:

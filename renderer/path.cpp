@@ -11,32 +11,27 @@ namespace {
 
 constexpr float kCover = 5e-3f;  // metres
 constexpr int kSureBounces = 5;  // roulette may end a path after these
+constexpr int kMostPassed = 256;
 
 class PathIntegrator {
  public:
-  PathIntegrator(const Mesh& mesh, const Environment* environment, int bounces,
+  PathIntegrator(const World& world, const Environment* environment, int bounces,
                  const float* irradiance = nullptr, float gather_from = 0)
-      : mesh_(mesh),
+      : world_(world),
         environment_(environment),
-        emitters_(power(mesh)),
         bounces_(bounces),
         irradiance_(irradiance),
         gather_from_(gather_from) {
-    if (mesh.size()) {
-      accel_.add(mesh.vertices.data(), mesh.vertices.size() / 3, mesh.faces.data(), mesh.size());
-    }
-    accel_.commit();
     const bool sky = environment_ && !environment_->even();
-    pick_environment_ = !sky ? 0.0f : emitters_.empty() ? 1.0f : 0.5f;
-    // area density of a point on an emitter: (power / area) / sum of powers
-    if (!emitters_.empty()) inverse_power_ = float(1.0 / emitters_.sum());
+    pick_environment_ = !sky ? 0.0f : !world_.shines() ? 1.0f : 0.5f;
   }
 
-  // bsdf_density of d; 0: the last bounce was specular, or this is the camera ray.
+  // bsdf_density of d; 0: the last bounce was certain, or this is the camera ray.
   Vec3 radiance(Vec3 o, Vec3 d, Sampler& sampler, float bsdf_density = 0, int depth = 0) const {
-    Vec3 sum, beta(1.0f);
+    Vec3 sum, beta(1.0f), from = o;  // where the direction was chosen
+    int passed = 0;  // surfaces that let the ray through: no scatterings
     for (;; ++depth) {
-      const Hit hit = accel_.intersect(o, d);
+      const Hit hit = world_.intersect(o, d);
       if (!hit) {
         if (environment_) {
           const float w = bsdf_density == 0
@@ -47,44 +42,44 @@ class PathIntegrator {
         }
         return sum;
       }
-      const Vec3 emission = mesh_.face_emission(hit.face);
-      const Kind kind = Kind(mesh_.kind[hit.face]);
-      const Surface s = surface_at(mesh_, hit, d);
-      if (!is_zero(emission)) {
+      const Surface s = world_.surface_at(hit, d);
+      if (s.material->transmits) {
+        const Vec3 through = transmit(s, -d);
+        const float pass = mean(through);
+        if (pass > 0) {
+          const bool passes = pass >= 1 || sampler.pair().x < pass;
+          beta *= passes ? through * (1 / pass) : Vec3(1 / (1 - pass));
+          if (passes) {
+            if (++passed > kMostPassed) return sum;
+            o = s.start(d);
+            --depth;
+            continue;
+          }
+        }
+      }
+      if (!is_zero(s.emission)) {
         float w = 1;
         if (bsdf_density > 0) {
-          const float cos = -dot(s.ng, d);
-          w = power_heuristic(bsdf_density,
-                              emitter_density(emission) * hit.t * hit.t / cos);
+          const float cos = -dot(s.ng, d), t2 = length2(s.p - from);
+          w = power_heuristic(bsdf_density, (1 - pick_environment_) *
+                                                world_.emitter_density(hit) * t2 / cos);
         }
-        sum += w * beta * emission;
+        sum += w * beta * s.emission;
       }
       if (depth == bounces_) return sum;
-      const Vec3 albedo = mesh_.face_albedo(hit.face);
-      beta *= albedo;
-      if (largest(beta) == 0) return sum;
-
-      if (kind == Kind::diffuse) {
+      if (!is_specular(s)) {
         if (irradiance_ && bsdf_density > 0 && s.outside && hit.t > gather_from_) {
-          const Vec3 known = known_irradiance(hit);
-          if (is_finite(known)) return sum + (1 / kPi) * beta * known;
+          const Vec3 known = world_.interpolate(irradiance_, hit);
+          if (is_finite(known)) return sum + (1 / kPi) * beta * s.base * known;
         }
-        const Frame frame(s.ns);
-        const Vec3 start = lift(s.p, s.ng);
-        sum += beta * direct(start, s, sampler);
-        const Pair u = sampler.pair();
-        const Vec3 local = sample_cosine(u.x, u.y);
-        d = frame.world(local);
-        if (dot(d, s.ng) <= 0) return sum;
-        bsdf_density = std::max(local.z, 1e-6f) / kPi;
-        o = start;
-      } else {
-        bsdf_density = 0;
-        const float u = kind == Kind::glass ? sampler.pair().x : 0.0f;
-        const Bounce b = bounce_specular(s, d, kind, mesh_.ior[hit.face], u);
-        d = b.d;
-        o = lift(s.p, b.through ? -s.ng : s.ng);
+        sum += beta * direct(s, -d, sampler);
       }
+      const Scatter next = sample(s, -d, sampler);
+      beta *= next.weight;
+      if (largest(beta) == 0) return sum;
+      bsdf_density = next.density;
+      d = next.wi;
+      from = o = s.start(d);
       if (depth >= kSureBounces) {  // the root ends fewer paths, and those it spares stay quiet
         const float survive = std::min(1.0f, std::sqrt(largest(beta)));
         if (sampler.pair().x >= survive) return sum;
@@ -94,43 +89,25 @@ class PathIntegrator {
   }
 
   // Whether another face lies on this one, as a lamp lies on a ceiling.
-  bool covered(Vec3 p, Vec3 n) const { return accel_.intersect(lift(p, n), n).t < kCover; }
+  bool covered(Vec3 p, Vec3 n) const { return world_.intersect(p + near(p) * n, n).t < kCover; }
 
   // One sample of the irradiance at a point with normal n.
   Vec3 irradiance(Vec3 p, Vec3 n, Sampler& sampler) const {
-    const Surface s{p, n, n, true};
-    const Vec3 start = lift(p, n);
-    Vec3 sum = direct(start, s, sampler);
-    const Pair u = sampler.pair();
-    const Vec3 local = sample_cosine(u.x, u.y);
-    sum += radiance(start, Frame(n).world(local), sampler, std::max(local.z, 1e-6f) / kPi, 1);
-    return kPi * sum;
+    Surface s{};
+    s.p = p, s.ng = s.ns = n, s.rise = near(p);
+    s.base = Vec3(1.0f), s.alpha = 1, s.outside = true;
+    const Vec3 sum = direct(s, n, sampler);
+    const Scatter next = sample(s, n, sampler);
+    return kPi * (sum + radiance(s.start(next.wi), next.wi, sampler, next.density, 1));
   }
 
  private:
-  Vec3 known_irradiance(const Hit& hit) const {
-    const uint32_t* f = &mesh_.faces[3 * hit.face];
-    return (1 - hit.u - hit.v) * Vec3(&irradiance_[3 * f[0]]) +
-           hit.u * Vec3(&irradiance_[3 * f[1]]) + hit.v * Vec3(&irradiance_[3 * f[2]]);
-  }
+  // Points that are given lie near a face, not on it.
+  static float near(Vec3 p) { return 8 * kLift * largest_magnitude(p); }
 
-  static std::vector<float> power(const Mesh& mesh) {
-    std::vector<float> p(mesh.size());
-    for (uint32_t f = 0; f < mesh.size(); ++f) {
-      const float area = 0.5f * length(cross(mesh.corner(f, 1) - mesh.corner(f, 0),
-                                             mesh.corner(f, 2) - mesh.corner(f, 0)));
-      p[f] = area * mean(mesh.face_emission(f));
-    }
-    return p;
-  }
-
-  float emitter_density(Vec3 emission) const {  // 1/m^2
-    return (1 - pick_environment_) * mean(emission) * inverse_power_;
-  }
-
-  // One light sample, weighted against the cosine sample; without the albedo.
-  Vec3 direct(Vec3 start, const Surface& s, Sampler& sampler) const {
-    if (pick_environment_ == 0 && emitters_.empty()) return {};
+  // One light sample, weighted against the surface's own: radiance that it sends to wo.
+  Vec3 direct(const Surface& s, Vec3 wo, Sampler& sampler) const {
+    if (pick_environment_ == 0 && !world_.shines()) return {};
     Pair u = sampler.pair();
     bool sky = pick_environment_ == 1;
     if (pick_environment_ > 0 && !sky) {  // an even chance by the first bit, the rest goes on
@@ -138,49 +115,46 @@ class PathIntegrator {
       u.bits <<= 1;
     }
     if (sky) {
-      const auto sample = environment_->sample(u.bits, u.y);
-      const float cos = dot(sample.direction, s.ns);
-      if (cos <= 0 || dot(sample.direction, s.ng) <= 0) return {};
-      if (accel_.occluded(start, sample.direction)) return {};
-      const float density = pick_environment_ * sample.density;
-      const float w = power_heuristic(density, cos / kPi);
-      return (w * cos / (kPi * density)) * environment_->radiance(sample.direction);
+      const auto light = environment_->sample(u.bits, u.y);
+      const Vec3 f = shade(s, wo, light.direction);
+      if (is_zero(f)) return {};
+      const Vec3 share = world_.transmittance(s.start(light.direction), light.direction);
+      if (is_zero(share)) return {};
+      const float p = pick_environment_ * light.density;
+      const float w = power_heuristic(p, density(s, wo, light.direction));
+      return (w / p) * share * f * environment_->radiance(light.direction);
     }
-    const auto pick = emitters_.sample(u.bits);
-    const Vec3 a = mesh_.corner(pick.index, 0);
-    const Vec3 ab = mesh_.corner(pick.index, 1) - a, ac = mesh_.corner(pick.index, 2) - a;
-    const float root = std::sqrt(pick.rest);
-    const Vec3 q = a + root * (1 - u.y) * ab + root * u.y * ac;
-    Vec3 n = normalize(cross(ab, ac));
-    if (dot(n, start - q) < 0) n = -n;
-    const Vec3 to = lift(q, n) - start;
+    const World::Emitter light = world_.sample_emitter(u);
+    const Vec3 n = dot(light.n, s.p - light.p) < 0 ? -light.n : light.n;
+    const Vec3 start = s.start(light.p - s.p);
+    const Vec3 to = light.p + light.rise * n - start;
     const float distance2 = length2(to);
     const Vec3 d = to * (1 / std::sqrt(distance2));
-    const float cos = dot(d, s.ns), cos_light = -dot(d, n);
-    if (cos <= 0 || cos_light <= 0 || dot(d, s.ng) <= 0) return {};
-    if (accel_.occluded(start, to, 1.0f)) return {};
-    const Vec3 emission = mesh_.face_emission(pick.index);
-    const float density = emitter_density(emission) * distance2 / cos_light;
-    const float w = power_heuristic(density, cos / kPi);
-    return (w * cos / (kPi * density)) * emission;
+    const float cos_light = -dot(d, n);
+    if (!(cos_light > 0)) return {};
+    const Vec3 f = shade(s, wo, d);
+    if (is_zero(f)) return {};
+    const Vec3 share = world_.transmittance(start, to, 1 - kLift);
+    if (is_zero(share)) return {};
+    const float p = (1 - pick_environment_) * light.density * distance2 / cos_light;
+    const float w = power_heuristic(p, density(s, wo, d));
+    return (w / p) * share * f * light.radiance;
   }
 
-  const Mesh& mesh_;
+  const World& world_;
   const Environment* environment_;
-  Distribution emitters_;
-  Accel accel_;
   int bounces_;
   const float* irradiance_;
   float gather_from_;
-  float pick_environment_ = 0, inverse_power_ = 0;
+  float pick_environment_ = 0;
 };
 
 }  // namespace
 
-void path_trace(const Mesh& mesh, const PixelRays& rays, Vec3 origin, int spp, uint64_t seed,
+void path_trace(const World& world, const PixelRays& rays, Vec3 origin, int spp, uint64_t seed,
                 int bounces, const Environment* environment, const float* irradiance,
                 float gather_from, float* radiance) {
-  const PathIntegrator integrator(mesh, environment, bounces, irradiance, gather_from);
+  const PathIntegrator integrator(world, environment, bounces, irradiance, gather_from);
   const SampleTable table(spp, seed);
   const tbb::blocked_range2d<int> tiles(0, rays.height, 16, 0, rays.width, 16);
   tbb::parallel_for(tiles, [&](const auto& tile) {
@@ -204,10 +178,10 @@ void path_trace(const Mesh& mesh, const PixelRays& rays, Vec3 origin, int spp, u
   });
 }
 
-void irradiance(const Mesh& mesh, const float* points, const float* normals, size_t count,
+void irradiance(const World& world, const float* points, const float* normals, size_t count,
                 int spp, uint64_t seed, int bounces, const Environment* environment,
                 float* irradiance) {
-  const PathIntegrator integrator(mesh, environment, bounces);
+  const PathIntegrator integrator(world, environment, bounces);
   const SampleTable table(spp, seed);
   tbb::parallel_for(tbb::blocked_range<size_t>(0, count, 64), [&](const auto& range) {
     const FlushDenormals flush;

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from chromeball.renderer import core
 from chromeball.renderer.mesh import Mesh, Values
+from chromeball.renderer.world import world
 from chromeball.scene.camera import CameraModel
 
 
@@ -63,9 +64,11 @@ def path_trace(
     """
     if spp < 1 or max_bounces < 0:
         raise ValueError("spp must be at least 1, max_bounces at least 0")
+    if irradiance is not None and len(irradiance) != len(mesh.vertices):
+        raise ValueError("irradiance and vertices differ in length")
     x, y, z = (float(v) for v in np.asarray(origin, float))
     return core.path_trace(
-        mesh.core(),
+        world([mesh]),
         np.ascontiguousarray(rays, np.float32),
         (x, y, z),
         spp,

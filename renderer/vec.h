@@ -45,6 +45,14 @@ inline bool is_zero(Vec3 a) { return a.x == 0 && a.y == 0 && a.z == 0; }
 inline bool is_finite(Vec3 a) {
   return std::isfinite(a.x) && std::isfinite(a.y) && std::isfinite(a.z);
 }
+inline Vec3 abs(Vec3 a) { return {std::abs(a.x), std::abs(a.y), std::abs(a.z)}; }
+inline Vec3 mix(Vec3 a, Vec3 b, float t) { return (1 - t) * a + t * b; }
+inline float mix(float a, float b, float t) { return (1 - t) * a + t * b; }
+// Unit length whatever the size of the numbers; `otherwise` for a vector without a direction.
+inline Vec3 unit_or(Vec3 a, Vec3 otherwise) {
+  const float m = largest_magnitude(a);
+  return m > 0 && m < 3e38f ? normalize(a * (1 / m)) : otherwise;
+}
 inline Vec3 reflect(Vec3 d, Vec3 n) { return d - 2.0f * dot(d, n) * n; }
 
 // An orthonormal basis around n (Duff et al. 2017).
@@ -58,6 +66,12 @@ struct Frame {
     t = {b, sign + n.y * n.y * a, -n.y};
   }
   Vec3 world(Vec3 v) const { return v.x * s + v.y * t + v.z * n; }
+  Vec3 local(Vec3 v) const { return {dot(v, s), dot(v, t), dot(v, n)}; }
+};
+
+struct Mat3 {
+  Vec3 x{1, 0, 0}, y{0, 1, 0}, z{0, 0, 1};  // rows
+  Vec3 operator*(Vec3 v) const { return {dot(x, v), dot(y, v), dot(z, v)}; }
 };
 
 // Cosine-weighted direction around +z; density cos / pi.

@@ -25,8 +25,8 @@ def test_tessellation_keeps_area_materials_and_small_triangles() -> None:
         return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
 
     assert area(divided).sum() == pytest.approx(area(mesh).sum(), rel=1e-5)
-    power = (area(divided)[:, None] * divided.emission).sum(0)
-    np.testing.assert_allclose(power, (area(mesh)[:, None] * mesh.emission).sum(0), rtol=1e-4)
+    power = (area(divided)[:, None] * divided.emission()).sum(0)
+    np.testing.assert_allclose(power, (area(mesh)[:, None] * mesh.emission()).sum(0), rtol=1e-4)
     corners = divided.vertices[divided.faces]
     assert np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max() <= 0.4 + 1e-5
     assert np.linalg.norm(inward - divided.vertices, axis=1).max() <= 0.04 * 0.4 + 1e-6

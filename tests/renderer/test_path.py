@@ -189,6 +189,8 @@ def test_broken_meshes_are_refused() -> None:
     wrong[2, 0] = 8
     with pytest.raises(UserError, match="a face names vertex 8, the mesh has 8"):
         Mesh.of(vertices, wrong)
+    with pytest.raises(UserError, match="albedo of face 3 are NaN or infinite"):
+        Mesh.of(vertices, faces, np.where(np.arange(12) == 3, np.inf, 0.5)[:, None])
     good = Mesh.of(vertices, faces)
-    with pytest.raises(UserError, match="albedo of face 0"):
-        replace(good, albedo=np.full((12, 3), np.inf, np.float32))
+    with pytest.raises(UserError, match="names material 1, the mesh has 1"):
+        replace(good, material=np.ones(12, np.uint16))

@@ -1,0 +1,91 @@
+"""Objects for the C++ core: each mesh once, however often it stands in the scene."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import get_args
+
+import numpy as np
+
+from chromeball.renderer import core
+from chromeball.renderer.material import Material, Texture, Wrap
+from chromeball.renderer.mesh import Instance, Mesh
+from chromeball.scene.errors import UserError
+
+_ALPHA_MODES = ("opaque", "mask", "blend")
+_WRAPS: tuple[Wrap, ...] = get_args(Wrap.__value__)
+
+
+def world(objects: Sequence[Mesh | Instance]) -> core.World:
+    """The core's scene of these objects, in their order; a mesh stands where its vertices are.
+
+    Objects that share a :class:`Mesh` share one copy of it and one BVH; materials and textures
+    that are equal are stored once.
+    """
+    built = core.World()
+    textures: dict[Texture, int] = {}
+    materials: dict[Material, int] = {}
+    meshes: dict[int, int] = {}
+
+    def texture(value: Texture | None) -> int:
+        if value is None:
+            return -1
+        if value not in textures:
+            pixels = np.ascontiguousarray(value.pixels, np.float32)
+            wrap = (_WRAPS.index(value.wrap[0]), _WRAPS.index(value.wrap[1]))
+            textures[value] = built.add_texture(pixels, wrap)
+        return textures[value]
+
+    def material(m: Material) -> int:
+        if m not in materials:
+            _check(m)
+            materials[m] = built.add_material(
+                base=m.base_color,
+                metallic=m.metallic,
+                roughness=m.roughness,
+                specular=m.specular,
+                ior=m.ior,
+                transmission=m.transmission,
+                thin=m.thin,
+                clearcoat=m.clearcoat,
+                clearcoat_roughness=m.clearcoat_roughness,
+                emission=m.emission,
+                alpha=m.alpha,
+                alpha_mode=_ALPHA_MODES.index(m.alpha_mode),
+                alpha_cutoff=m.alpha_cutoff,
+                normal_scale=m.normal_scale,
+                textures=(
+                    texture(m.base_color_texture),
+                    texture(m.metallic_roughness_texture),
+                    texture(m.normal_texture),
+                    texture(m.emission_texture),
+                ),
+            )
+        return materials[m]
+
+    def mesh(m: Mesh) -> int:
+        if id(m) not in meshes:
+            numbers = np.array([material(x) for x in m.materials], np.uint32)
+            meshes[id(m)] = built.add_mesh(
+                np.ascontiguousarray(m.vertices, np.float32),
+                None if m.normals is None else np.ascontiguousarray(m.normals, np.float32),
+                None if m.uv is None else np.ascontiguousarray(m.uv, np.float32),
+                np.ascontiguousarray(m.faces, np.uint32),
+                numbers[m.material],
+            )
+        return meshes[id(m)]
+
+    for thing in objects:
+        instance = thing if isinstance(thing, Instance) else Instance(thing)
+        built.place(mesh(instance.mesh), instance.matrix())
+    built.commit()
+    return built
+
+
+def _check(m: Material) -> None:
+    """Refuse what has no shader yet."""
+    glass = m.transmission == 1 and m.roughness == 0 and not m.thin
+    mirror = m.transmission == 0 and m.metallic == 1 and m.roughness == 0
+    diffuse = m.transmission == 0 and m.metallic == 0 and m.specular == 0
+    if m.clearcoat or m.metallic_roughness_texture or not (glass or mirror or diffuse):
+        raise UserError("a material is neither diffuse, a mirror nor smooth glass: change it")
