@@ -149,6 +149,7 @@ class Compositor:
             seed,
             samples,
         )
+        self.look(rays, camera, plate)
 
     def look(
         self,

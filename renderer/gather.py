@@ -120,6 +120,7 @@ def tessellate(mesh: Mesh, edge: float) -> tuple[Mesh, NDArray[np.bool_], NDArra
         count += int(keep.sum())
     parent = np.concatenate(parents)
     everything = np.concatenate(vertices)
+
     def grown(values: NDArray[np.float32] | None) -> NDArray[np.float32] | None:
         if values is None:
             return None

@@ -170,7 +170,9 @@ class Mesh:
             norm = np.linalg.norm(turned, axis=1, keepdims=True)
             normals = (turned / np.where(norm > 0, norm, 1)).astype(np.float32)
         vertices = pose.apply(self.vertices * factors).astype(np.float32)
-        return replace(self, vertices=vertices, normals=normals)
+        # a reflection turns the corners about
+        faces = self.faces if factors.prod() > 0 else np.ascontiguousarray(self.faces[:, ::-1])
+        return replace(self, vertices=vertices, faces=faces, normals=normals)
 
     def albedo(self) -> NDArray[np.float32]:
         """The base colour of each face, (F, 3), textures left out."""
@@ -231,7 +233,9 @@ def _materials(
     table = np.concatenate([np.broadcast_to(g, (rows, g.shape[1])) for g in given], axis=1)
     if not np.isfinite(table).all():
         face, column = np.argwhere(~np.isfinite(table))[0]
-        name = ("albedo", "emission", "kind", "ior")[np.searchsorted([3, 6, 7], column, "right")]
+        name = ("albedo", "emission", "kind", "ior")[
+            np.searchsorted([3, 6, 7], column, "right")
+        ]
         raise UserError(f"{name} of face {face} are NaN or infinite")
     unique, inverse = np.unique(table, axis=0, return_inverse=True)
     if len(unique) > _MOST_MATERIALS:
