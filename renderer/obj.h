@@ -53,18 +53,20 @@ class ObjReader {
     const int64_t counts[3] = {int64_t(obj_.positions.size() / 3),
                                int64_t(obj_.uvs.size() / 2),
                                int64_t(obj_.normals.size() / 3)};
-    static constexpr const char* kNames[3] = {"vertex", "texture coordinate", "normal"};
-    for (size_t i = 0; i < obj_.vertices.size(); ++i) {
-      if (obj_.vertices[i] >= counts[i % 3]) {
-        throw std::invalid_argument(std::string("a face names ") + kNames[i % 3] + " " +
-                                    std::to_string(obj_.vertices[i] + int64_t(1)) +
-                                    ", the mesh has " + std::to_string(counts[i % 3]));
+    for (size_t kind = 0; kind < 3; ++kind) {
+      for (size_t i = kind; i < obj_.vertices.size(); i += 3) {
+        if (obj_.vertices[i] >= counts[kind]) {
+          throw std::invalid_argument(std::string("a face names ") + kNames[kind] + " " +
+                                      std::to_string(obj_.vertices[i] + int64_t(1)) +
+                                      ", the mesh has " + std::to_string(counts[kind]));
+        }
       }
     }
     return std::move(obj_);
   }
 
  private:
+  static constexpr const char* kNames[3] = {"vertex", "texture coordinate", "normal"};
   struct Key {
     int32_t v[3];
     bool operator==(const Key& o) const {
@@ -198,7 +200,6 @@ class ObjReader {
     }
     const int64_t from_zero = value < 0 ? count + value : value - 1;
     if (from_zero < 0 || from_zero >= INT32_MAX) {
-      static constexpr const char* kNames[3] = {"vertex", "texture coordinate", "normal"};
       fail(std::string("a face names ") + kNames[kind] + " " + std::to_string(value) +
            ", the mesh has " + std::to_string(count));
     }

@@ -70,6 +70,25 @@ class Part:
             parts[0].pose,
         )
 
+    def baked(self) -> Part:
+        """The same triangles at the same place, with the world's coordinates."""
+        linear, offset = self.pose[:3, :3], self.pose[:3, 3]
+        if np.array_equal(self.pose, np.eye(4)):
+            return self
+        mirrored = bool(np.linalg.det(linear) < 0)
+        normals = None
+        if self.normals is not None:
+            turned = self.normals @ np.linalg.inv(linear)
+            norm = np.linalg.norm(turned, axis=1, keepdims=True)
+            normals = (turned / np.where(norm > 0, norm, 1)).astype(np.float32)
+        return replace(
+            self,
+            vertices=(self.vertices @ linear.T + offset).astype(np.float32),
+            faces=self.faces[:, ::-1] if mirrored else self.faces,
+            normals=normals,
+            pose=np.eye(4),
+        )
+
     def moved(self, pose: NDArray[np.float64]) -> Part:
         """The same part, its place moved by `pose` (4, 4)."""
         return replace(self, pose=pose @ self.pose)
@@ -126,18 +145,15 @@ def face_areas(vertices: NDArray[np.float32], faces: NDArray[Any]) -> NDArray[np
 def smooth(part: Part, angle: float) -> Part:
     """With normals averaged over edges flatter than `angle` (radians), split at the others.
 
-    Faces are weighted by their angle at the vertex (Thuermer and Wuethrich 1998). Vertices at
-    the same place count as one, so seams of texture coordinates stay smooth.
+    Faces are weighted by their angle at the vertex (Thuermer and Wuethrich 1998). Vertices
+    within a millionth of the mesh's size count as one, so seams of uv stay smooth.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
     faces = part.faces
     count = len(faces)
-    _, place = np.unique(
-        np.ascontiguousarray(part.vertices + np.float32(0)).view("V12"), return_inverse=True
-    )
-    at = place.reshape(-1)[faces]  # (F, 3) places of the corners
+    at = _places(part.vertices)[faces]  # (F, 3) of the corners
     normal = _normals(part.vertices, faces)
     unit = normal / np.linalg.norm(normal, axis=1, keepdims=True)
     # each edge twice, once a face, sorted so that those of the same two places are neighbours
@@ -173,6 +189,15 @@ def smooth(part: Part, angle: float) -> Part:
         normals=sums[group[first]].astype(np.float32),
         uv=None if part.uv is None else part.uv[old],
     )
+
+
+def _places(vertices: NDArray[np.float32]) -> NDArray[np.intp]:
+    """A number for each vertex (V,), the same for those within rounding of each other."""
+    low = vertices.min(axis=0).astype(float)
+    step = 1e-6 * max(float((vertices.max(axis=0) - low).max()), 1e-300)
+    cells = np.round((vertices - low) / step).astype(np.int32)
+    _, place = np.unique(cells.view("V12"), return_inverse=True)
+    return place.reshape(-1)
 
 
 def _normals(vertices: NDArray[np.float32], faces: NDArray[Any]) -> NDArray[np.float64]:

@@ -231,7 +231,7 @@ class _Mtl:
         )
 
     def material(self) -> Material:
-        illum = round(self.number("illum", 2))
+        illum = round(self.number("illum", 2.0))
         alpha = self.number("d", 1 - self.number("Tr", 0.0))
         emission = self.color("Ke", 0.0)
         base = self.color("Kd", 0.5)

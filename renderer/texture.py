@@ -44,7 +44,7 @@ def read_texture(
                 f"{width} x {height} pixels are too many for a texture; make it smaller",
                 file=path,
             )
-    pixels = read_image(path).pixels
+    pixels = read_image(path, straight_alpha=True).pixels
     linear = _decoded(pixels, color)
     if linear.shape[2] == 2:  # grey and alpha
         linear = linear[..., [0, 0, 0, 1]]

@@ -77,8 +77,10 @@ class Image:
         return np.maximum(pixels, 0) if meant else pixels
 
 
-def read_image(path: str | os.PathLike[str]) -> Image:
+def read_image(path: str | os.PathLike[str], *, straight_alpha: bool = False) -> Image:
     """Read a whole picture with its exposure metadata.
+
+    Colours come multiplied by alpha, unless `straight_alpha` is asked for.
 
     Raises
     ------
@@ -106,7 +108,9 @@ def read_image(path: str | os.PathLike[str]) -> Image:
         raise UserError("truncated or damaged picture: the PNG is not whole", file=path)
     import OpenImageIO as oiio
 
-    source = oiio.ImageInput.open(os.fspath(path))
+    config = oiio.ImageSpec()
+    config.attribute("oiio:UnassociatedAlpha", int(straight_alpha))
+    source = oiio.ImageInput.open(os.fspath(path), config)
     if source is None:
         raise UserError(f"not a readable picture: {_reason(oiio.geterror)}", file=path)
     try:
