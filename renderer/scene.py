@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from chromeball.renderer.assets import read_parts
 from chromeball.renderer.mesh import Kind, Mesh
