@@ -71,7 +71,9 @@ class Composite:
     (H, W, 3) radiance of the objects times alpha; ``standard_error`` (H, W) of the pixel's
     mean brightness; ``depth`` (H, W) mean distance of the first surface in metres, 0 where
     there is none; ``changed`` (H, W) bool, the other pixels are the plate's bits.
-    ``clipped``: pixels whose noise would have made them negative, set to 0.
+    ``clipped``: pixels whose noise would have made them negative, set to 0. ``kept``,
+    ``added`` (H, W, 3): what is left of the plate and what comes to it,
+    rgb = kept plate + added.
     """
 
     rgb: NDArray[np.float32]
@@ -82,6 +84,8 @@ class Composite:
     depth: NDArray[np.float32]
     changed: NDArray[np.bool_]
     clipped: int
+    kept: NDArray[np.float32]
+    added: NDArray[np.float32]
 
     def relative_error(self) -> float:
         """Typical standard error of a changed pixel over the mean of them all; 0 if none."""
@@ -261,11 +265,13 @@ class Compositor:
         alpha = film[..., _COVERAGE] / n
         objects = film[..., _OBJECT] / n[..., None]
         change = film[..., _CHANGE] / n[..., None]
-        added = (
-            film[..., _DIFFERENCE] / n[..., None] if self._difference else self.plate * change
-        )
         changed = (alpha > 0) | (change != 0).any(axis=2)
-        blend = self.plate * (1 - alpha[..., None]) + objects + added
+        kept, added = np.repeat(1 - alpha[..., None], 3, axis=2), objects
+        if self._difference:
+            added = added + film[..., _DIFFERENCE] / n[..., None]
+        else:
+            kept += change
+        blend = self.plate * kept + added
         clipped = changed & (blend < 0).any(axis=2)
         rgb = np.where(changed[..., None], np.maximum(blend, 0), self.plate)
         support = film[..., _SUPPORT, None]
@@ -287,6 +293,8 @@ class Compositor:
             depth=_float32(depth),
             changed=changed,
             clipped=int(clipped.sum()),
+            kept=_float32(kept),
+            added=_float32(added),
         )
 
 

@@ -179,7 +179,7 @@ class _Picture:
             raise UserError("tiles of one picture need equally many samples: say --spp alone")
         if budget == Budget():
             budget = Budget(spp=scene.render.spp)
-        return cls(task, scene, view, file.parent, check_target(target), budget)
+        return cls(task, scene, view, file.parent, check_target(target, view.look), budget)
 
     # ---- what is finished
 

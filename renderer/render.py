@@ -13,13 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chromeball.renderer.composite import CapturedSet, Composite, Compositor
+from chromeball.renderer.exposed import expose
+from chromeball.renderer.look import CameraLook, apply_look, read_look
 from chromeball.renderer.path import corner_rays
 from chromeball.renderer.scene import object_meshes, turn
 from chromeball.scene.camera import WORLD_FROM_LATLONG, CameraModel
 from chromeball.scene.color import luminance
 from chromeball.scene.errors import UserError
 from chromeball.scene.image import read_image, read_rgb, to_display, write_exr, write_picture
-from chromeball.scene.manifest import Scene, View
+from chromeball.scene.manifest import Look, Scene, View
 from chromeball.scene.pose import Pose
 from chromeball.scene.record import Stage, check_output
 from chromeball.stand_in.ply import read_stand_in
@@ -66,6 +68,7 @@ class Job:
     size: tuple[int, int]
     exposure: float | None
     inputs: tuple[Path, ...]
+    look: CameraLook
 
 
 def prepare(scene: Scene, folder: Path, view: View, spp: int) -> Job:
@@ -90,7 +93,7 @@ def prepare(scene: Scene, folder: Path, view: View, spp: int) -> Job:
     if scene.stand_in:
         inputs.append(build / "stand_in.ply")
         stand_in = read_stand_in(inputs[-1])
-    plate = None
+    plate = plate_file = None
     if view.bracket or view.plate:
         plate_file = build / f"{view.bracket}.exr" if view.bracket else folder / str(view.plate)
         # posed by four points, or a file that holds the pose
@@ -121,7 +124,9 @@ def prepare(scene: Scene, folder: Path, view: View, spp: int) -> Job:
         seed=scene.render.seed,
         samples=spp,
     )
-    return Job(view.name, compositor, captured, camera.size, view.exposure, tuple(inputs))
+    look, read = read_look(view.look, scene, folder, plate_file, compositor.plate, camera)
+    inputs += read
+    return Job(view.name, compositor, captured, camera.size, view.exposure, tuple(inputs), look)
 
 
 def virtual_camera(view: View, origin: NDArray[np.float64]) -> CameraModel:
@@ -193,12 +198,20 @@ def accumulate(
             return compositor.result()
 
 
-def check_target(output: str | os.PathLike[str]) -> Path:
-    """The EXR that a composite is written to, refused early where it or its PNG cannot be."""
+def check_target(output: str | os.PathLike[str], look: Look | None = None) -> Path:
+    """The EXR that a composite is written to, refused early where it or its PNG cannot be.
+
+    `look` says what else is written beside them.
+    """
     target = Path(output)
     if target.suffix.lower() != ".exr":
         raise UserError("the composite is an EXR file; name it so", file=target)
-    for file in (target, target.with_suffix(".png")):
+    outputs = [target, target.with_suffix(".png")]
+    if look is not None and look.response is not None:
+        outputs.append(target.with_suffix(".camera.png"))
+    if look is not None and look.jpeg is not None:
+        outputs.append(target.with_suffix(".camera.jpg"))
+    for file in outputs:
         check_output(file)
     return target
 
@@ -211,10 +224,13 @@ def expected_samples(budget: Budget) -> int:
 def write_composite(stage: Stage, job: Job, composite: Composite, target: Path) -> None:
     """Write the EXR with its layers and the PNG as outputs of `stage`, and its figures.
 
+    Where the view's look asks for it, VIEW.camera.png and .jpg too: the plate camera's codes.
+
     The EXR holds R G B A, ``quotient.R G B``, ``objects.R G B`` (premultiplied),
     ``error.Y`` (standard error of the brightness) and ``depth.Z`` in metres.
     """
-    seconds = stage.elapsed()
+    seconds, relative_error = stage.elapsed(), composite.relative_error()
+    composite, added = apply_look(composite, job.compositor.plate, job.look)
     exposure = job.exposure or automatic_exposure(composite.rgb)
     png = target.with_suffix(".png")
     changed = composite.changed
@@ -227,7 +243,7 @@ def write_composite(stage: Stage, job: Job, composite: Composite, target: Path) 
         "seconds": seconds,
         "mrays_per_second": job.compositor.rays_traced / max(seconds, 1e-9) / 1e6,
         # one sample says nothing of its noise
-        "relative_error": composite.relative_error() if job.compositor.samples > 1 else None,
+        "relative_error": relative_error if job.compositor.samples > 1 else None,
         "median_standard_error": float(np.median(relative)) if relative.size else 0.0,
         "changed_pixels": int(changed.sum()),
         "coverage": float(composite.alpha.mean()),
@@ -235,11 +251,20 @@ def write_composite(stage: Stage, job: Job, composite: Composite, target: Path) 
         "clipped_png_pixels": int(clipped.sum()),
         "exposure": exposure,
         "png": png.name,
+        "look": job.look.figures() | added,
     }
     with stage.output(target) as temporary:
         _write_layers(temporary, composite)
     with stage.output(png) as temporary:
         write_picture(temporary, to_display(composite.rgb, exposure))
+    camera = job.look.exposed
+    if camera is not None:
+        codes = expose(composite.rgb, camera.response, camera.exposure)
+        with stage.output(target.with_suffix(".camera.png")) as temporary:
+            write_picture(temporary, codes)
+        if camera.quality is not None:
+            with stage.output(target.with_suffix(".camera.jpg")) as temporary:
+                write_picture(temporary, codes, quality=camera.quality)
 
 
 def automatic_exposure(rgb: NDArray[np.float32]) -> float:

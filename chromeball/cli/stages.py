@@ -406,6 +406,8 @@ class _Planner:
             )
         if bracket.moving:
             options.append("--deghost")
+        if any(view.look.noise and view.bracket == bracket.name for view in self.rendered):
+            options.append("--sigma")
         hdr = self.scene.hdr
         if hdr.snr:
             options += _option("snr", f"{hdr.snr:.10g}")
@@ -640,13 +642,21 @@ class _Planner:
             inputs.append(view.camera)
         inputs += [o.mesh for o in scene.object if o.mesh not in ("sphere", "box", "cylinder")]
         picture = f"{self.build}/{view.name}.exr"
+        pictures = [picture, f"{self.build}/{view.name}.png"]
+        look = view.look
+        if look.response is not None:
+            solved = scene.hdr.response or f"{self.build}/response.json"
+            inputs.append(solved if look.response == "plate" else look.response)
+            pictures.append(f"{self.build}/{view.name}.camera.png")
+        if look.jpeg is not None:
+            pictures.append(f"{self.build}/{view.name}.camera.jpg")
         count = len(scene.object)
         return StagePlan(
             name,
             True,
             f"{count} object{'s' if count > 1 else ''} at {scene.render.spp} samples a pixel",
             tuple(dict.fromkeys(inputs)),
-            (picture, f"{self.build}/{view.name}.png"),
+            tuple(pictures),
             ("chromeball", "render", self.file, *_option("view", view.name), "-o", picture),
             {"object": scene.object, "render": scene.render, "view": view},
         )

@@ -241,6 +241,30 @@ class ViewKey(Table, frozen=True):
     fov: float | None = None
 
 
+class Look(Table, frozen=True):
+    """The plate camera's own faults, given to what is synthetic.
+
+    ``noise``: of the plate's variance and grain, from its ``sigma`` channels (`hdr merge
+    --sigma`) where it has them. ``softness``: edges as soft as the plate's. ``vignetting``:
+    c1, c2, ... of the fall-off 1 + c1 r^2 + c2 r^4 + ..., r = 1 at half the plate's diagonal.
+    ``response``: `plate`, the curve that the plate was merged with, or a response.json; makes
+    VIEW.camera.png, the codes that the camera would have given at the exposure of the plate's
+    frame number ``frame`` (from 0; unless given, the one that shows most). ``jpeg``: quality
+    of a VIEW.camera.jpg beside it.
+    """
+
+    noise: bool = False
+    softness: bool = False
+    vignetting: list[float] = []
+    response: str | None = None
+    frame: Annotated[int, Meta(ge=0)] | None = None
+    jpeg: Annotated[int, Meta(ge=1, le=100)] | None = None
+
+    def __post_init__(self) -> None:
+        if self.response is None and (self.frame is not None or self.jpeg is not None):
+            raise ValueError("frame and jpeg say how `response` is applied: give it too")
+
+
 class View(Table, frozen=True):
     """A picture to make, or a sequence of them.
 
@@ -273,6 +297,7 @@ class View(Table, frozen=True):
     frames: str | None = None
     key: list[ViewKey] = []
     interpolation: Literal["linear", "cubic"] = "linear"
+    look: Look = Look()
 
 
 class Calibrate(Table, frozen=True):
