@@ -17,6 +17,15 @@ Captured::Captured(const StandIn& stand_in, const Environment& environment, Vec3
 
 void Captured::find_planes() {
   const StandIn& stand_in = stand_in_;
+  const Vec3 corner = stand_in.corner(0, 0);
+  const Vec3 across = normalize(cross(stand_in.corner(0, 1) - corner,
+                                      stand_in.corner(0, 2) - corner));
+  for (uint32_t f = 0; f < stand_in.size(); ++f) {
+    for (int k = 0; k < 3; ++k) {
+      const Vec3 to = stand_in.corner(f, k) - corner;
+      flat_ &= std::abs(dot(to, across)) <= 1e-4f * length(to);
+    }
+  }
   const size_t v = stand_in.vertices.size() / 3;
   accel_.add(stand_in.vertices.data(), v, stand_in.faces.data(), stand_in.size());
   Accel original;  // the set as it was when the map was captured
@@ -72,6 +81,21 @@ float Captured::jacobian(Vec3 x, Vec3 q, Vec3 n) const {
   const float cos_o = std::abs(dot(from_o, n)) / std::sqrt(o2);
   const float cos_x = std::abs(dot(from_x, n)) / std::sqrt(x2);
   return cos_x > 1e-6f ? cos_o * x2 / (o2 * cos_x) : 0;
+}
+
+Lamp Captured::lamp(Vec3 d, uint32_t texel) const {
+  Lamp lamp;
+  lamp.place = d;
+  if (planes_.empty() || is_zero(planes_[texel].n)) return lamp;
+  const Plane& plane = planes_[texel];
+  const float cos = dot(plane.n, d);
+  const float z = (plane.offset - dot(plane.n, origin_)) / cos;
+  lamp.finite = true;
+  lamp.n = plane.n;
+  lamp.distance = z > 0 && z < kInfinity ? z : 0;  // 0: moved from under its light
+  lamp.place = origin_ + lamp.distance * d;
+  lamp.cos_o = std::abs(cos);
+  return lamp;
 }
 
 Captured::Light Captured::draw(uint32_t k, uint64_t seed) const {

@@ -43,6 +43,37 @@ struct Place {
   Vec3 start() const { return p + rise * n; }
 };
 
+// A piece of the captured light: at a place in the set, or infinitely far in a direction.
+struct Lamp {
+  Vec3 place;
+  bool finite = false;
+  Vec3 n;          // unit normal of the surface that shows the light
+  float distance;  // of the place from the map's origin
+  Vec3 flux;       // radiance times its solid angle at the origin
+
+  // Finite lamps nearer to a point than this are left to rays that search the neighbourhood:
+  // seen from there the list is too coarse.
+  static constexpr float kNear = 0.35f;
+
+  struct Incident {
+    Vec3 d;
+    float t;
+    float share;  // irradiance at normal incidence over flux; 0: too near, or edge on
+  };
+  Incident incident(Vec3 x) const {
+    if (!finite) return {place, kInfinity, 1};
+    const Vec3 to = place - x;
+    const float x2 = length2(to), t = std::sqrt(x2);
+    if (t < kNear * distance) return {{}, 0, 0};
+    return {to * (1 / t), t, spread(std::abs(dot(to, n)) / t, x2)};
+  }
+  // d omega_x / d omega_o of the surface element (seeds F11's Jacobian).
+  float spread(float cos_x, float x2) const {
+    return cos_o > 1e-4f ? cos_x * distance * distance / (cos_o * x2) : 0;
+  }
+  float cos_o = 1;  // at the lamp, towards the origin
+};
+
 class Captured {
  public:
   Captured(const StandIn& stand_in, const Environment& environment, Vec3 origin, uint64_t seed);
@@ -51,6 +82,13 @@ class Captured {
   bool blocked(Vec3 o, Vec3 d, float tfar) const { return accel_.occluded(o, d, tfar); }
   bool positional() const { return !accel_.empty(); }
   const StandIn& stand_in() const { return stand_in_; }
+  const Environment& environment() const { return environment_; }
+  const Accel& accel() const { return accel_; }
+  // Nothing but one plane, which cannot keep light from itself nor from what stands on it.
+  bool flat() const { return flat_; }
+
+  // Of a place from the map's origin.
+  float distance(const Place& place) const { return length(place.captured_at - origin_); }
 
   // L_cap: the radiance that the map holds for a place, or for a direction to infinity.
   Vec3 radiance(const Place& place, Vec3 d) const;
@@ -69,6 +107,9 @@ class Captured {
     if (sample.t == kInfinity) return !place;
     return place && std::abs(place.t - sample.t) < 1e-3f * sample.t;
   }
+  // Where the light of a direction (of that texel) comes from; without its flux. distance 0: from
+  // nowhere, a stand-in was moved from under its light.
+  Lamp lamp(Vec3 d, uint32_t texel) const;
   // The density with which `sample` picks direction d, whose first place is `place`.
   float density(Vec3 x, Vec3 d, const Place& place) const;
 
@@ -99,6 +140,7 @@ class Captured {
   Accel accel_;
   std::vector<Plane> planes_;
   std::vector<Light> lights_;
+  bool flat_ = true;
 };
 
 }  // namespace chromeball

@@ -29,6 +29,8 @@ struct Film {
 };
 
 class Compositor {
+  friend class Direct;
+
  public:
   Compositor(World& objects, const StandIn& stand_in, const Environment& environment,
              Vec3 origin, int bounces, uint64_t seed, uint32_t expected_samples);

@@ -8,6 +8,7 @@
 #include <tbb/parallel_for.h>
 
 #include "composite.h"
+#include "direct.h"
 #include "path.h"
 #include "world.h"
 
@@ -116,6 +117,7 @@ class CompositorArrays {
   }
   Compositor* operator->() { return &*compositor_; }
   const Compositor* operator->() const { return &*compositor_; }
+  const Compositor& operator*() const { return *compositor_; }
 
  private:
   nb::object objects_;  // a WorldArrays
@@ -300,4 +302,39 @@ NB_MODULE(core, m) {
             return std::array{E.x, E.y, E.z};
           },
           nb::arg("point"), nb::arg("normal"));
+
+  nb::class_<Direct>(m, "Direct")
+      .def("__init__",
+           [](Direct* self, const CompositorArrays& scene, uint64_t seed) {
+             nb::gil_scoped_release release;
+             new (self) Direct(*scene, seed);
+           },
+           nb::arg("scene"), nb::arg("seed"), nb::keep_alive<1, 2>())
+      .def("begin", &Direct::begin, nb::arg("height"), nb::arg("width"))
+      .def(
+          "add",
+          [](Direct& self, Picture corners, std::array<float, 3> camera, int samples) {
+            nb::gil_scoped_release release;
+            return self.pass(pixel_rays(corners), Vec3(camera.data()), samples);
+          },
+          nb::arg("corners"), nb::arg("camera"), nb::arg("samples"))
+      .def(
+          "resolve",
+          [](const Direct& self, Picture corners, std::array<float, 3> camera, Picture plate,
+             bool difference, bool filter, bool layers) {
+            const PixelRays rays = pixel_rays(corners);
+            if (int(plate.shape(0)) != rays.height || int(plate.shape(1)) != rays.width) {
+              throw nb::value_error("rays and plate differ in size");
+            }
+            NewPicture rgb(rays.height, rays.width, 3);
+            NewPicture out(layers ? rays.height : 0, layers ? rays.width : 0, Direct::kLayers);
+            {
+              nb::gil_scoped_release release;
+              self.resolve(rays, Vec3(camera.data()), plate.data(), difference, filter, rgb.data,
+                           layers ? out.data : nullptr);
+            }
+            return std::pair(rgb.release(), out.release());
+          },
+          nb::arg("corners"), nb::arg("camera"), nb::arg("plate"), nb::arg("difference"),
+          nb::arg("filter"), nb::arg("layers"));
 }

@@ -36,9 +36,9 @@ std::vector<uint32_t> hilbert_order(int h, int w) {
   return order;
 }
 
-// What each texel has above the mean over the sphere, times its solid angle; the margin keeps
-// rounding from counting as light.
-std::vector<float> power_above_mean(const std::vector<float>& rgb, int h, int w) {
+// What each texel has above a share of the mean over the sphere, times its solid angle.
+std::vector<float> power_above(float share_of_mean, const std::vector<float>& rgb, int h,
+                               int w) {
   const auto solid_angle = [&](size_t t) {
     const double y = double(t / w);
     return 2 * M_PI / w * (std::cos(M_PI * y / h) - std::cos(M_PI * (y + 1) / h));
@@ -46,7 +46,7 @@ std::vector<float> power_above_mean(const std::vector<float>& rgb, int h, int w)
   std::vector<float> power(rgb.size() / 3);
   double sum = 0;
   for (size_t t = 0; t < power.size(); ++t) sum += mean(Vec3(&rgb[3 * t])) * solid_angle(t);
-  const double level = sum / (4 * M_PI) * (1 + 1e-5);
+  const double level = sum / (4 * M_PI) * share_of_mean;
   for (size_t t = 0; t < power.size(); ++t) {
     power[t] = float(std::max(0.0, mean(Vec3(&rgb[3 * t])) - level) * solid_angle(t));
   }
@@ -80,11 +80,16 @@ Environment::Environment(const float* rgb, int h, int w)
     : h_(h),
       w_(w),
       rgb_(rgb, rgb + size_t(3) * h * w),
-      probability_(power_above_mean(rgb_, h, w)),
+      probability_(power_above(1 + 1e-5f, rgb_, h, w)),  // rounding does not count as light
+      whole_(power_above(0, rgb_, h, w)),
       order_(hilbert_order(h, w)),
-      distribution_(reordered(probability_, order_)) {
-  const float scale = even() ? 0.0f : float(1.0 / distribution_.sum());
-  for (float& p : probability_) p *= scale;
+      distribution_(reordered(probability_, order_)),
+      power_(reordered(whole_, order_)) {
+  const auto normalise = [](std::vector<float>& p, double sum) {
+    for (float& v : p) v = sum > 0 ? float(v / sum) : 0.0f;
+  };
+  normalise(probability_, distribution_.sum());
+  normalise(whole_, power_.sum());
 }
 
 Environment::Footprint Environment::footprint(float u, float v) const {
@@ -117,22 +122,32 @@ Vec3 Environment::texel_direction(uint32_t t) const {
 }
 
 // The bilinear probability per texel area over the solid angle of that area.
-float Environment::density_at(float u, float v) const {
+float Environment::density_at(const std::vector<float>& probability, float u, float v) const {
   const Footprint f = footprint(u, v);
   float p = 0;
-  for (int k = 0; k < 4; ++k) p += f.weight[k] * probability_[f.texel[k]];
+  for (int k = 0; k < 4; ++k) p += f.weight[k] * probability[f.texel[k]];
   const float r = std::sin((v + 0.5f) / h_ * kPi);
   return r > 0 ? p * w_ * h_ / (2 * kPi * kPi * r) : 0;
 }
 
 float Environment::density(Vec3 d) const {
   const Pixel p = pixel_of(d, h_, w_);
-  return density_at(p.u, p.v);
+  return density_at(probability_, p.u, p.v);
 }
 
-// A texel by its power, then a tent around it: the density is the bilinear map itself.
+// A texel by its probability, then a tent around it: the density is the bilinear map itself.
 Environment::Sample Environment::sample(uint32_t bits, float v) const {
-  const auto pick = distribution_.sample(bits);
+  return sample(distribution_, probability_, bits, v);
+}
+
+Environment::Sample Environment::sample_power(uint32_t bits, float v) const {
+  return sample(power_, whole_, bits, v);
+}
+
+Environment::Sample Environment::sample(const Distribution& distribution,
+                                        const std::vector<float>& probability, uint32_t bits,
+                                        float v) const {
+  const auto pick = distribution.sample(bits);
   const uint32_t t = order_[pick.index];
   const auto tent = [](float x) {
     return x < 0.5f ? std::sqrt(2 * x) - 1 : 1 - std::sqrt(2 - 2 * x);
@@ -146,7 +161,7 @@ Environment::Sample Environment::sample(uint32_t bits, float v) const {
   if (p.u >= w_ - 0.5f) p.u -= w_;
   const int x = std::clamp(int(p.u + 0.5f), 0, w_ - 1);
   const int y = std::clamp(int(p.v + 0.5f), 0, h_ - 1);
-  return {direction_of(p, h_, w_), density_at(p.u, p.v), uint32_t(y) * w_ + x};
+  return {direction_of(p, h_, w_), density_at(probability, p.u, p.v), uint32_t(y) * w_ + x};
 }
 
 }  // namespace chromeball

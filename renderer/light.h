@@ -60,6 +60,7 @@ class Environment {
   int width() const { return w_; }
   // Nothing stands out of the mean, so that there is nothing to sample by importance.
   bool even() const { return distribution_.empty(); }
+  bool black() const { return power_.empty(); }
 
   Vec3 radiance(Vec3 d) const;  // bilinear; d of unit length
   float density(Vec3 d) const;  // of `sample`, 1/sr
@@ -72,6 +73,8 @@ class Environment {
     uint32_t texel;  // that the direction lies in
   };
   Sample sample(uint32_t bits, float v) const;
+  // The same in proportion to the whole map, for use without another strategy.
+  Sample sample_power(uint32_t bits, float v) const;
 
  private:
   // Bilinear weights around (u, v), texel centres at integers.
@@ -80,13 +83,16 @@ class Environment {
     float weight[4];
   };
   Footprint footprint(float u, float v) const;
-  float density_at(float u, float v) const;
+  float density_at(const std::vector<float>& probability, float u, float v) const;
+  Sample sample(const Distribution& distribution, const std::vector<float>& probability,
+                uint32_t bits, float v) const;
 
   int h_, w_;
   std::vector<float> rgb_;
-  std::vector<float> probability_;  // of each texel
+  std::vector<float> probability_;  // of each texel, by what exceeds the mean
+  std::vector<float> whole_;        // of each texel, by its power
   std::vector<uint32_t> order_;  // texels along a Hilbert curve: near in order, near in space
-  Distribution distribution_;
+  Distribution distribution_, power_;
 };
 
 }  // namespace chromeball

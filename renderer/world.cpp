@@ -159,6 +159,14 @@ size_t World::triangles() const {
   return sum;
 }
 
+Vec3 World::centre(uint32_t instance) const {
+  const Instance& of = instances_[instance];
+  const auto& spheres = meshes_[of.mesh].bounds;
+  Vec3 sum;
+  for (const Sphere& s : spheres) sum += s.centre;
+  return of.to_world.point(sum * (1 / float(std::max<size_t>(1, spheres.size()))));
+}
+
 void World::find_bounds() {
   bounds_.clear();
   for (const Instance& i : instances_) {

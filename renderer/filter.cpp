@@ -1,0 +1,119 @@
+#include "filter.h"
+
+#include <algorithm>
+
+namespace chromeball {
+
+// Means over the passes, with an apron of the neighbours; whether there is anything.
+bool Filter::load(const FilmTile* const (&around)[9], bool objects, int passes) {
+  const float per_pass = 1 / float(passes);
+  bool any = false;
+  for (int y = 0; y < kSide; ++y) {
+    const int down = y - kApron + kTile;
+    for (int x = 0; x < kSide; ++x) {
+      const int across = x - kApron + kTile, at = y * kSide + x;
+      const FilmTile* tile = around[down / kTile * 3 + across / kTile];
+      share_[at] = 0, variance_[at] = 0, group_[at] = 0;
+      for (int c = 0; c < 3; ++c) v_[c][at] = 0, n_[c][at] = 0;
+      if (!tile) continue;
+      const FilmTile::Layer& layer = objects ? tile->objects : tile->set;
+      const int i = down % kTile * kTile + across % kTile;
+      const float share = layer.share[i];
+      if (!(share > 0)) continue;
+      any = true;
+      share_[at] = share * per_pass;
+      group_[at] = layer.group[i];
+      const float* const sums[3] = {layer.r, layer.g, layer.b};
+      for (int c = 0; c < 3; ++c) {
+        const float base = objects ? tile->albedo[c][i] : share;
+        v_[c][at] = base > 0 ? sums[c][i] / base : 0;
+      }
+      variance_[at] = layer.variance[i] * per_pass * per_pass;
+      if (!objects) continue;
+      const Vec3 n(layer.nx[i], layer.ny[i], layer.nz[i]);
+      const float l = length(n), inverse = l > 0 ? 1 / l : 0.0f;
+      n_[0][at] = n.x * inverse, n_[1][at] = n.y * inverse, n_[2][at] = n.z * inverse;
+    }
+  }
+  return any;
+}
+
+void Filter::run(const FilmTile* const (&around)[9], bool objects, int passes, bool filter) {
+  if (load(around, objects, passes) && filter) {
+    objects ? smooth<true>() : smooth<false>();
+    return;
+  }
+  for (int y = 0; y < kTile; ++y) {
+    for (int x = 0; x < kTile; ++x) {
+      const int at = (y + kApron) * kSide + x + kApron;
+      for (int c = 0; c < 3; ++c) out_[c][y * kTile + x] = v_[c][at];
+      out_[3][y * kTile + x] = variance_[at];
+    }
+  }
+}
+
+template <bool kGuided>
+void Filter::smooth() {
+  // how alike two places' surfaces are: 0 across surfaces
+  const auto alike = [&](int p, int q) {
+    const float same = group_[p] == group_[q] ? share_[q] : 0.0f;
+    if constexpr (!kGuided) return same;
+    const float cos = std::max(
+        0.0f, n_[0][p] * n_[0][q] + n_[1][p] * n_[1][q] + n_[2][p] * n_[2][q]);
+    const float c2 = cos * cos, c4 = c2 * c2, c8 = c4 * c4;
+    return same * c8 * c8;
+  };
+
+  constexpr int kInner = kSide - 2 * kMeans;
+  for (int y = kMeans; y < kSide - kMeans; ++y) {
+    float sum[kInner] = {}, noise[kInner] = {}, weight[kInner] = {};
+    for (int dy = -kMeans; dy <= kMeans; ++dy) {
+      for (int dx = -kMeans; dx <= kMeans; ++dx) {
+        const int row = y * kSide + kMeans, off = dy * kSide + dx;
+#pragma GCC ivdep
+        for (int x = 0; x < kInner; ++x) {
+          const int p = row + x, q = p + off;
+          const float w = alike(p, q);
+          sum[x] += w * (v_[0][q] + v_[1][q] + v_[2][q]);
+          noise[x] += w * variance_[q];
+          weight[x] += w;
+        }
+      }
+    }
+    for (int x = 0; x < kInner; ++x) {
+      const float inverse = weight[x] > 0 ? 1 / weight[x] : 0.0f;
+      mean_[y * kSide + kMeans + x] = sum[x] * inverse * (1.0f / 3);
+      noise_[y * kSide + kMeans + x] = noise[x] * inverse;
+    }
+  }
+
+  constexpr float kWindow = (2 * kMeans + 1) * (2 * kMeans + 1);
+  constexpr float kTolerance = 8 / kWindow;  // of squared differences of means, over variances
+  for (int y = 0; y < kTile; ++y) {
+    alignas(64) float sum[4][kTile] = {}, weight[kTile] = {};
+    const int row = (y + kApron) * kSide + kApron;
+    for (int dy = -kReach; dy <= kReach; ++dy) {
+      for (int dx = -kReach; dx <= kReach; ++dx) {
+        const int off = dy * kSide + dx;
+#pragma GCC ivdep
+        for (int x = 0; x < kTile; ++x) {
+          const int p = row + x, q = p + off;
+          const float difference = mean_[p] - mean_[q];
+          const float allowed = kTolerance * (noise_[p] + noise_[q]) + 1e-12f;
+          const float near = std::max(0.0f, 1 - difference * difference / allowed);
+          const float w = alike(p, q) * near * near;
+          sum[0][x] += w * v_[0][q], sum[1][x] += w * v_[1][q], sum[2][x] += w * v_[2][q];
+          sum[3][x] += w * w * variance_[q];
+          weight[x] += w;
+        }
+      }
+    }
+    for (int x = 0; x < kTile; ++x) {
+      const float inverse = weight[x] > 0 ? 1 / weight[x] : 0.0f;
+      for (int c = 0; c < 3; ++c) out_[c][y * kTile + x] = sum[c][x] * inverse;
+      out_[3][y * kTile + x] = sum[3][x] * inverse * inverse;
+    }
+  }
+}
+
+}  // namespace chromeball
