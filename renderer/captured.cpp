@@ -83,19 +83,43 @@ float Captured::jacobian(Vec3 x, Vec3 q, Vec3 n) const {
   return cos_x > 1e-6f ? cos_o * x2 / (o2 * cos_x) : 0;
 }
 
-Lamp Captured::lamp(Vec3 d, uint32_t texel) const {
-  Lamp lamp;
-  lamp.place = d;
-  if (planes_.empty() || is_zero(planes_[texel].n)) return lamp;
-  const Plane& plane = planes_[texel];
-  const float cos = dot(plane.n, d);
-  const float z = (plane.offset - dot(plane.n, origin_)) / cos;
-  lamp.finite = true;
-  lamp.n = plane.n;
-  lamp.distance = z > 0 && z < kInfinity ? z : 0;  // 0: moved from under its light
-  lamp.place = origin_ + lamp.distance * d;
-  lamp.cos_o = std::abs(cos);
-  return lamp;
+std::vector<Lamp> Captured::lamps(uint32_t count, uint64_t seed) const {
+  std::vector<Lamp> lamps;
+  if (environment_.black()) return lamps;
+  lamps.resize(count);
+  Accel original;  // the set as it was when the map was captured
+  if (positional()) {
+    original.add(stand_in_.original.data(), stand_in_.original.size() / 3,
+                 stand_in_.faces.data(), stand_in_.size());
+  }
+  original.commit();
+  const uint32_t stratum = uint32_t((uint64_t(1) << 32) / count);
+  for (uint32_t k = 0; k < count; ++k) {
+    const uint64_t h = mix64(seed + k);
+    const auto s =
+        environment_.sample_power(k * stratum + uint32_t(h) % stratum, float(h >> 40) * 0x1p-24f);
+    Lamp& lamp = lamps[k];
+    lamp.place = s.direction;
+    lamp.flux = environment_.radiance(s.direction) * (1 / (s.density * float(count)));
+    const Hit hit = positional() ? original.intersect(origin_, s.direction) : Hit();
+    if (!hit) continue;
+    const auto at = [&](auto corner) {
+      return (1 - hit.u - hit.v) * corner(0) + hit.u * corner(1) + hit.v * corner(2);
+    };
+    const auto area = [&](auto corner) {
+      return cross(corner(1) - corner(0), corner(2) - corner(0));
+    };
+    const auto then = [&](int i) { return stand_in_.original_corner(hit.face, i); };
+    const auto now = [&](int i) { return stand_in_.corner(hit.face, i); };
+    const Vec3 before = area(then), after = area(now);
+    lamp.finite = true;
+    lamp.place = at(now);
+    lamp.n = stand_in_.normal(hit.face);
+    lamp.distance = hit.t;
+    // an element of the face has grown with the face since
+    lamp.cos_o = std::abs(dot(before, s.direction)) / length(after);
+  }
+  return lamps;
 }
 
 Captured::Light Captured::draw(uint32_t k, uint64_t seed) const {

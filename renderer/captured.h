@@ -48,7 +48,7 @@ struct Lamp {
   Vec3 place;
   bool finite = false;
   Vec3 n;          // unit normal of the surface that shows the light
-  float distance;  // of the place from the map's origin
+  float distance = 0;  // of the place from the map's origin
   Vec3 flux;       // radiance times its solid angle at the origin
 
   // Finite lamps nearer to a point than this are left to rays that search the neighbourhood:
@@ -71,7 +71,7 @@ struct Lamp {
   float spread(float cos_x, float x2) const {
     return cos_o > 1e-4f ? cos_x * distance * distance / (cos_o * x2) : 0;
   }
-  float cos_o = 1;  // at the lamp, towards the origin
+  float cos_o = 1;  // at the lamp, towards the origin; less where the surface has grown since
 };
 
 class Captured {
@@ -107,9 +107,8 @@ class Captured {
     if (sample.t == kInfinity) return !place;
     return place && std::abs(place.t - sample.t) < 1e-3f * sample.t;
   }
-  // Where the light of a direction (of that texel) comes from; without its flux. distance 0: from
-  // nowhere, a stand-in was moved from under its light.
-  Lamp lamp(Vec3 d, uint32_t texel) const;
+  // The whole light as `count` lamps of about equal power, along the map's Hilbert curve.
+  std::vector<Lamp> lamps(uint32_t count, uint64_t seed) const;
   // The density with which `sample` picks direction d, whose first place is `place`.
   float density(Vec3 x, Vec3 d, const Place& place) const;
 

@@ -4,6 +4,7 @@
 #include <nanobind/stl/array.h>
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/pair.h>
+#include <nanobind/stl/tuple.h>
 
 #include <tbb/parallel_for.h>
 
@@ -310,6 +311,7 @@ NB_MODULE(core, m) {
              new (self) Direct(*scene, seed);
            },
            nb::arg("scene"), nb::arg("seed"), nb::keep_alive<1, 2>())
+      .def("objects_moved", &Direct::objects_moved)
       .def("begin", &Direct::begin, nb::arg("height"), nb::arg("width"))
       .def(
           "add",
@@ -328,12 +330,13 @@ NB_MODULE(core, m) {
             }
             NewPicture rgb(rays.height, rays.width, 3);
             NewPicture out(layers ? rays.height : 0, layers ? rays.width : 0, Direct::kLayers);
+            size_t clipped;
             {
               nb::gil_scoped_release release;
-              self.resolve(rays, Vec3(camera.data()), plate.data(), difference, filter, rgb.data,
-                           layers ? out.data : nullptr);
+              clipped = self.resolve(rays, Vec3(camera.data()), plate.data(), difference, filter,
+                                     rgb.data, layers ? out.data : nullptr);
             }
-            return std::pair(rgb.release(), out.release());
+            return std::tuple(rgb.release(), out.release(), clipped);
           },
           nb::arg("corners"), nb::arg("camera"), nb::arg("plate"), nb::arg("difference"),
           nb::arg("filter"), nb::arg("layers"));

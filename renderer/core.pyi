@@ -94,3 +94,20 @@ class Compositor:
     def irradiance(
         self, point: tuple[float, float, float], normal: tuple[float, float, float]
     ) -> list[float]: ...
+
+class Direct:
+    def __init__(self, scene: Compositor, seed: int) -> None: ...
+    def objects_moved(self) -> None: ...
+    def begin(self, height: int, width: int) -> None: ...
+    def add(
+        self, corners: NDArray[float32], camera: tuple[float, float, float], samples: int
+    ) -> int: ...
+    def resolve(
+        self,
+        corners: NDArray[float32],
+        camera: tuple[float, float, float],
+        plate: NDArray[float32],
+        difference: bool,
+        filter: bool,
+        layers: bool,
+    ) -> tuple[NDArray[float32], NDArray[float32], int]: ...

@@ -91,6 +91,7 @@ struct Direct::ShadowRays {
     Vec3* square;
     Vec3 light;
     bool takes;  // light is taken away where an object is in between, else given where none is
+    bool set_may_hide;  // the set itself may keep the light away
   } target[Packet::kWidth];
 
   explicit ShadowRays(const Direct& direct) : direct(direct) {}
@@ -110,19 +111,17 @@ struct Direct::ShadowRays {
     const World& objects = *direct.scene_.objects_;
     bool hidden[Packet::kWidth], by_set[Packet::kWidth] = {};
     for (int k = 0; k < count; ++k) hidden[k] = packet.blocked(k);
-    if (!direct.captured_.flat()) {
-      // light that the set itself keeps away is neither given nor taken
-      int left = 0;
-      for (int k = 0; k < count; ++k) {
-        const bool matters = hidden[k] == target[k].takes || objects.transmits();
-        packet.valid[k] = matters ? -1 : 0;
-        packet.rays.ray.tfar[k] = far[k];
-        left += matters;
-      }
-      if (left) {
-        traced += uint64_t(left);
-        occluded(direct.captured_.accel().scene(), packet, false);
-      }
+    // light that the set itself keeps away is neither given nor taken
+    int left = 0;
+    for (int k = 0; k < count; ++k) {
+      const bool matters = hidden[k] == target[k].takes || objects.transmits();
+      packet.valid[k] = matters && target[k].set_may_hide ? -1 : 0;
+      packet.rays.ray.tfar[k] = far[k];
+      left += packet.valid[k] != 0;
+    }
+    if (left) {
+      traced += uint64_t(left);
+      occluded(direct.captured_.accel().scene(), packet, false);
       for (int k = 0; k < count; ++k) by_set[k] = packet.valid[k] && packet.blocked(k);
     }
     for (int k = 0; k < count; ++k) {
@@ -184,7 +183,7 @@ const LightLists::List& Direct::list(uint32_t owner, uint32_t bin) const {
     const bool set = owner + 1 == centre_.size();
     const Vec3 n = set ? plane_normal_[bin / 2] * (bin & 1 ? -1.0f : 1.0f)
                        : LightLists::middle_of(bin);
-    lazy.list = lights_.draw(centre_[owner], n, set ? 0.0f : 0.12f,
+    lazy.list = lights_.draw(centre_[owner], n, set ? 0.0f : LightLists::kSlack,
                              set ? kFloorLamps : kObjectLamps, 0.5f);
   });
   return lazy.list;
@@ -304,6 +303,11 @@ uint64_t Direct::shade(const PixelRays& rays, Vec3 camera, int samples, int x0, 
   const StandIn& set = captured_.stand_in();
   const uint32_t set_lists = uint32_t(centre_.size()) - 1;
   ShadowRays shadows(*this);
+  const bool positional = captured_.positional(), flat = positional && captured_.flat();
+  Vec3 above;  // a flat set: its normal, towards the camera
+  if (flat) {
+    above = plane_normal_[0] * (dot(camera - set.corner(0, 0), plane_normal_[0]) < 0 ? -1 : 1);
+  }
 
   const auto near_object = [&](int x, int y) {
     for (int v = std::max(y - 1, 0); v <= std::min(y + 1, height_ - 1); ++v) {
@@ -388,7 +392,7 @@ uint64_t Direct::shade(const PixelRays& rays, Vec3 camera, int samples, int x0, 
     const float cos = dot(in.d, n);
     if (cos <= 0 || in.share == 0) return;
     const Vec3 light = c.flux * (in.share * cos * float(m));
-    shadows.push(start, in.d, in.t * (1 - 1e-3f), {sum, square, light, true});
+    shadows.push(start, in.d, in.t * (1 - 1e-3f), {sum, square, light, true, positional && !flat});
   };
   // Where little can be hidden few rays will do, and some pixels go without: `part` of them ask.
   struct Share {
@@ -476,9 +480,6 @@ uint64_t Direct::shade(const PixelRays& rays, Vec3 camera, int samples, int x0, 
   }
 
   // sub-samples where objects are
-  const bool flat = captured_.positional() && captured_.flat();
-  Vec3 above;
-  if (flat) above = plane_normal_[0] * (dot(camera - set.corner(0, 0), plane_normal_[0]) < 0 ? -1.0f : 1.0f);
   const float whole = 1 / float(samples);
   Packet packet;
   uint64_t traced = 0;
@@ -499,7 +500,7 @@ uint64_t Direct::shade(const PixelRays& rays, Vec3 camera, int samples, int x0, 
                                       dot(tile.samples[first + k].d, above)
                                 : 0;
       const bool hidden_by_none = flat && hits[k] && !(before > 0 && before < hits[k].t);
-      packet.valid[k] = captured_.positional() && !hidden_by_none ? -1 : 0;
+      packet.valid[k] = positional && !hidden_by_none ? -1 : 0;
       left += packet.valid[k] != 0;
     }
     if (left) intersect(captured_.accel().scene(), packet, true), traced += left;
@@ -538,10 +539,13 @@ uint64_t Direct::shade(const PixelRays& rays, Vec3 camera, int samples, int x0, 
           const float cos = dot(in.d, s.n);
           if (cos <= 0 || in.share == 0 || dot(in.d, surface.ng) <= 0) continue;
           const Vec3 light = c.flux * (in.share * cos * float(m) / kRaysOfSample);
-          shadows.push(start, in.d, in.t * (1 - 1e-3f), {&s.value, &s.square, light, false});
+          const bool set_may_hide =
+              positional && (!flat || (in.t == kInfinity && dot(in.d, above) < 0));
+          shadows.push(start, in.d, in.t * (1 - 1e-3f),
+                       {&s.value, &s.square, light, false, set_may_hide});
         }
         // what is near in the set, by a ray that looks for it
-        if (captured_.positional()) {
+        if (positional) {
           const Pair a = spread(uint32_t(passes_ * samples + s.i));
           const Vec3 d = Frame(s.n).world(sample_cosine(fraction(a.x + turn(py, px + 1)),
                                                         fraction(a.y + turn(px + 2, py))));
@@ -550,7 +554,7 @@ uint64_t Direct::shade(const PixelRays& rays, Vec3 camera, int samples, int x0, 
             const Place place = captured_.trace(start, d);
             if (place && place.t < Lamp::kNear * captured_.distance(place)) {
               shadows.push(start, d, place.t * (1 - 1e-3f),
-                           {&s.value, &s.square, kPi * captured_.radiance(place, d), false});
+                           {&s.value, &s.square, kPi * captured_.radiance(place, d), false, false});
             }
           }
         }
@@ -628,8 +632,9 @@ uint64_t Direct::pass(const PixelRays& rays, Vec3 camera, int samples) {
   return traced;
 }
 
-void Direct::resolve(const PixelRays& rays, Vec3 camera, const float* plate, bool difference,
-                     bool filter, float* rgb, float* layers) const {
+size_t Direct::resolve(const PixelRays& rays, Vec3 camera, const float* plate,
+                       bool difference, bool filter, float* rgb, float* layers) const {
+  std::atomic<size_t> clipped{0};
   const int across = tiles_across(), down = tiles_down();
   const float per_pass = 1 / float(std::max(1, passes_));
   const auto layer = [&](size_t i, Vec3 object, float alpha, Vec3 dq, float error, float depth) {
@@ -687,7 +692,10 @@ void Direct::resolve(const PixelRays& rays, Vec3 camera, const float* plate, boo
             L = captured_.radiance(captured_.trace(camera, d), d);
           }
           out = B * (1 - alpha) + L * dq * share + object;
-          out = {std::max(out.x, 0.0f), std::max(out.y, 0.0f), std::max(out.z, 0.0f)};
+          if (std::min(out.x, std::min(out.y, out.z)) < 0) {
+            ++clipped;
+            out = {std::max(out.x, 0.0f), std::max(out.y, 0.0f), std::max(out.z, 0.0f)};
+          }
           const float of_set = mean(L) * share, of_objects = mean(albedo);
           error = std::sqrt(of_set * of_set * set.variance(at) +
                             of_objects * of_objects * objects.variance(at));
@@ -698,6 +706,7 @@ void Direct::resolve(const PixelRays& rays, Vec3 camera, const float* plate, boo
       }
     }
   });
+  return clipped;
 }
 
 }  // namespace chromeball

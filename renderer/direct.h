@@ -28,15 +28,16 @@ class Direct {
   // The composite (H, W, 3) of all passes. `layers` (H, W, kLayers), where wanted, gets the mean
   // of each pixel: objects 3, alpha 1, Q 3, standard error of the brightness 1, depth 1.
   static constexpr int kLayers = 9;
-  void resolve(const PixelRays& rays, Vec3 camera, const float* plate, bool difference,
-               bool filter, float* rgb, float* layers) const;
+  // Returns how many pixels would be negative, which are cut at 0.
+  size_t resolve(const PixelRays& rays, Vec3 camera, const float* plate, bool difference,
+                 bool filter, float* rgb, float* layers) const;
 
   int passes() const { return passes_; }
 
  private:
   static constexpr int kTile = FilmTile::kSide;
   static constexpr size_t kMostOwners = 32;  // of lists; more objects share theirs
-  static constexpr uint32_t kFloorLamps = 2048, kObjectLamps = 512;
+  static constexpr uint32_t kFloorLamps = 2048, kObjectLamps = 1024;
 
   uint32_t owner_of(uint32_t instance) const;
   struct Tile;      // what is known of a tile while it is shaded

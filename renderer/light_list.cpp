@@ -2,18 +2,8 @@
 
 namespace chromeball {
 
-LightLists::LightLists(const Captured& captured, uint64_t seed) {
-  const Environment& map = captured.environment();
-  if (map.black()) return;
-  lamps_.resize(kLamps);
-  for (uint32_t k = 0; k < kLamps; ++k) {
-    const uint64_t h = mix64(seed + k);
-    const uint32_t stratum = uint32_t((uint64_t(1) << 32) / kLamps);
-    const auto s = map.sample_power(k * stratum + uint32_t(h) % stratum, float(h >> 40) * 0x1p-24f);
-    lamps_[k] = captured.lamp(s.direction, s.texel);
-    lamps_[k].flux = map.radiance(s.direction) * (1 / (s.density * float(kLamps)));
-  }
-}
+LightLists::LightLists(const Captured& captured, uint64_t seed)
+    : lamps_(captured.lamps(kLamps, seed)) {}
 
 uint32_t LightLists::bin_of(Vec3 n) {
   const float ax = std::abs(n.x), ay = std::abs(n.y), az = std::abs(n.z);

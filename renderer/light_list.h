@@ -13,8 +13,9 @@ namespace chromeball {
 
 class LightLists {
  public:
-  static constexpr int kGrid = 6;                    // cells along a face of the cube of normals
+  static constexpr int kGrid = 8;                    // cells along a face of the cube of normals
   static constexpr uint32_t kBins = 6 * kGrid * kGrid;
+  static constexpr float kSlack = 0.16f;  // sine of the widest angle in a cell
   static constexpr uint32_t kLamps = 8192;
 
   LightLists(const Captured& captured, uint64_t seed);

@@ -1,0 +1,252 @@
+"""The direct integrator against closed forms and against the path integrator."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from chromeball.renderer.composite import CapturedSet, Compositor
+from chromeball.renderer.mesh import Kind, Mesh
+from chromeball.renderer.path import corner_rays
+from chromeball.renderer.primitives import box, sphere
+from chromeball.scene.camera import CameraModel
+from chromeball.scene.errors import UserError
+from chromeball.scene.pose import Pose
+from chromeball.stand_in.ply import ENVIRONMENT, SUPPORT, StandInMesh
+
+SIZE = (48, 36)
+
+
+def ball(centre: tuple[float, float, float], radius: float, kind: Kind = Kind.DIFFUSE) -> Mesh:
+    vertices, faces, normals = sphere()
+    mesh = Mesh.of(vertices, faces, 0.6, kind=kind, normals=normals)
+    at = np.array(centre) - np.array([0, radius, 0])
+    return mesh.placed(Pose(np.eye(3), at), 2 * radius)
+
+
+def floor(half: float = 5.0) -> StandInMesh:
+    v = np.array([[-1, 0, 1], [1, 0, 1], [1, 0, -1], [-1, 0, -1]], np.float32) * half
+    faces = np.array([[0, 1, 2], [0, 2, 3]], np.uint32)
+    return StandInMesh(v, v, faces, np.full(2, SUPPORT, np.uint8))
+
+
+def room() -> StandInMesh:
+    """A box seen from inside, 4 x 2.5 x 4 m, whose floor receives, with a block in a corner."""
+    vertices, faces, _ = box()
+    walls = (vertices * np.array([4, 2.5, 4])).astype(np.float32)
+    block = (vertices * np.array([0.8, 0.6, 0.8]) + np.array([-1.2, 0, -0.6])).astype(
+        np.float32
+    )
+    low = (walls[faces][:, :, 1] == 0).all(axis=1)
+    surface = np.concatenate(
+        [np.where(low, SUPPORT, ENVIRONMENT), np.full(len(faces), SUPPORT)]
+    )
+    v = np.concatenate([walls, block])
+    f = np.concatenate([faces[:, ::-1], faces + np.uint32(len(walls))])
+    return StandInMesh(v, v, np.ascontiguousarray(f), surface.astype(np.uint8))
+
+
+def window_light(height: int = 64) -> NDArray[np.float32]:
+    """A dim warm surrounding with a bright window and a small lamp."""
+    sky = np.full((height, 2 * height, 3), 0.2, np.float32) * np.array(
+        [1, 0.9, 0.7], np.float32
+    )
+    sky[height // 6 : height // 3, height // 3 : height] += np.array([3, 4, 6], np.float32)
+    sky[height // 4, 3 * height // 2] += np.float32(300)
+    return sky
+
+
+def view_from(place: tuple[float, ...], size: tuple[int, int] = SIZE) -> CameraModel:
+    up = np.array([0.0, 1.0, 1e-3])
+    return CameraModel.pinhole(
+        size, 0.9, Pose.look_at(np.array(place), np.array([0.0, 0.2, 0.0]), up)
+    )
+
+
+def compositor(
+    objects: list[Mesh],
+    stand_in: StandInMesh | None,
+    environment: NDArray[np.float32],
+    integrator: Any = "direct",
+    seed: int = 0,
+    plate: NDArray[np.float32] | None = None,
+    filtered: bool = False,
+    view: CameraModel | None = None,
+    **options: Any,
+) -> Compositor:
+    view = view or view_from((0.0, 1.4, 1.9))
+    return Compositor(
+        objects,
+        CapturedSet(environment, np.array([0.0, 1.0, 0.0]), stand_in),
+        corner_rays(view),
+        view.world_from_camera.translation,
+        plate,
+        bounces=0,
+        seed=seed,
+        integrator=integrator,
+        filtered=filtered,
+        **options,
+    )
+
+
+def test_without_objects_the_plate_keeps_its_bits() -> None:
+    plate = np.random.default_rng(0).uniform(0, 1, (SIZE[1], SIZE[0], 3)).astype(np.float32)
+    job = compositor([], floor(), window_light(), plate=plate)
+    job.add(4)
+    result = job.result()
+    assert result.rgb.tobytes() == plate.tobytes()
+    assert not result.changed.any()
+
+
+def test_the_filter_does_not_touch_what_no_object_can_reach() -> None:
+    plate = np.random.default_rng(0).uniform(0, 1, (SIZE[1], SIZE[0], 3)).astype(np.float32)
+    job = compositor(
+        [ball((0, 0.3, 0), 0.1)], floor(), window_light(), plate=plate, filtered=True
+    )
+    job.add(4)
+    result = job.result()
+    kept = ~result.changed
+    assert 0.2 < kept.mean() < 0.95
+    assert (result.rgb[kept] == plate[kept]).all()
+
+
+@pytest.mark.parametrize("where", ["floor", "room"])
+def test_direct_and_path_agree(where: str) -> None:
+    objects = [ball((0.1, 0.25, 0.2), 0.25), ball((-0.5, 0.15, 0.6), 0.15)]
+    stand_in = floor() if where == "floor" else room()
+    environment = window_light()
+    truth = compositor(objects, stand_in, environment, "path", samples=1024)
+    truth.add(1024)
+    fast = compositor(objects, stand_in, environment, seed=3)
+    fast.add(512)
+    a, b = truth.result(), fast.result()
+    assert float(np.abs(a.alpha - b.alpha).max()) < 0.05
+    # the means of all that changes agree: no bias
+    solid = (a.alpha == 1) & (b.alpha == 1)
+    ground = (a.alpha == 0) & (b.alpha == 0)
+    assert b.rgb[solid].mean() == pytest.approx(a.rgb[solid].mean(), rel=4e-3)
+    assert b.quotient[ground].mean() == pytest.approx(a.quotient[ground].mean(), rel=1e-3)
+    # and every pixel does, within the noise of both and the grain of the list
+    shadow = np.abs(b.quotient - a.quotient)[ground].mean(axis=1)
+    assert float(np.quantile(shadow, 0.99)) < 0.03
+    light = np.abs(b.rgb / a.rgb - 1)[solid].mean(axis=1)
+    assert float(np.quantile(light, 0.95)) < 0.06
+
+
+def test_shadow_of_a_ball_under_an_even_sky_is_its_form_factor() -> None:
+    # irradiance blocked by a sphere above the horizon: (r / d)^2 cos (Howell, B-44)
+    r, h = 0.3, 0.8
+    plate = np.ones((SIZE[1], SIZE[0], 3), np.float32)
+    view = view_from((0.0, 2.4, 0.5))
+    job = compositor([ball((0, h, 0), r)], floor(), np.zeros((4, 8, 3), np.float32), "ao",
+                     plate=plate, view=view)  # fmt: skip
+    job.add(256)
+    result = job.result()
+    ground = result.alpha == 0
+    x, y = np.meshgrid(np.arange(SIZE[0], dtype=float), np.arange(SIZE[1], dtype=float))
+    rays = view.rays(np.stack([x, y], axis=-1))
+    o = view.world_from_camera.translation
+    p = o + rays * (-o[1] / rays[..., 1:2])
+    d = np.hypot(np.hypot(p[..., 0], p[..., 2]), h)
+    expected = 1 - (r / d) ** 2 * (h / d)
+    away = ground & (np.asarray(d) > 1.05 * h)
+    error = result.quotient[..., 0][away] - expected[away]
+    assert float(np.sqrt(np.mean(error**2))) < 4e-3
+    assert abs(float(error.mean())) < 1e-3
+
+
+def test_a_sun_loses_no_energy_and_throws_no_sparks() -> None:
+    sky = np.full((64, 128, 3), 0.05, np.float32)
+    sky[12, 70] = 1e5
+    plate = np.ones((SIZE[1], SIZE[0], 3), np.float32)
+    job = compositor([ball((0, 0.3, 0), 0.3)], floor(), sky, plate=plate)
+    job.add(16)
+    truth = compositor([ball((0, 0.3, 0), 0.3)], floor(), sky, "path", plate=plate)
+    truth.add(1024)
+    a, b = truth.result(), job.result()
+    solid = (a.alpha == 1) & (b.alpha == 1)
+    assert b.rgb[solid].mean() == pytest.approx(a.rgb[solid].mean(), rel=0.01)
+    assert b.rgb.max() < 1.05 * a.rgb.max()
+    ground = (a.alpha == 0) & (b.alpha == 0)
+    assert b.quotient[ground].mean() == pytest.approx(a.quotient[ground].mean(), abs=4e-3)
+
+
+def test_the_filter_lowers_the_error_and_gives_way_to_samples() -> None:
+    objects = [ball((0.1, 0.25, 0.2), 0.25)]
+    truth = compositor(objects, floor(), window_light(), seed=9)
+    truth.add(1024)
+    true = truth.picture()
+
+    def error(samples: int, filtered: bool) -> float:
+        job = compositor(objects, floor(), window_light(), filtered=filtered)
+        job.add(samples)
+        return float(np.sqrt(np.mean((job.picture() - true) ** 2)))
+
+    assert error(4, True) < 0.6 * error(4, False)
+    assert error(512, True) < 1.3 * error(512, False)
+
+
+def test_the_error_that_is_said_is_the_error() -> None:
+    objects = [ball((0.1, 0.25, 0.2), 0.25)]
+    truth = compositor(objects, floor(), window_light(), seed=9)
+    truth.add(1024)
+    job = compositor(objects, floor(), window_light())
+    job.add(32)
+    result = job.result()
+    true = np.abs(result.rgb - truth.picture()).mean(axis=2)[result.changed]
+    said = result.standard_error[result.changed]
+    assert 0.4 < float(np.sqrt(np.mean(true**2)) / np.sqrt(np.mean(said**2))) < 2
+
+
+def test_a_mirror_shows_the_set_and_glass_lets_light_through() -> None:
+    for kind in (Kind.MIRROR, Kind.GLASS):
+        objects = [ball((0.1, 0.25, 0.2), 0.25, kind)]
+        truth = compositor(objects, floor(), window_light(), "path")
+        truth.add(256)
+        job = compositor(objects, floor(), window_light(), seed=2)
+        job.add(64)
+        solid = (truth.result().alpha == 1) & (job.result().alpha == 1)
+        assert job.picture()[solid].mean() == pytest.approx(
+            truth.result().rgb[solid].mean(), rel=0.03
+        )
+
+
+def test_moving_an_object_is_building_it_there() -> None:
+    pose = Pose.from_rotation_vector(np.array([0.0, 0.5, 0.0]), np.array([0.2, 0.1, 0.1]))
+    vertices, faces, normals = box()
+    block = Mesh.of(vertices * np.float32(0.3), faces, 0.5, normals=normals)
+    moved = compositor([block], floor(), window_light())
+    moved.add(2)
+    moved.move(0, pose)
+    moved.add(4)
+    built = compositor([block.placed(pose)], floor(), window_light())
+    built.add(4)
+    difference = np.abs(moved.picture() - built.picture()).max(axis=2)
+    assert float(np.quantile(difference, 0.98)) < 1e-3
+
+
+def test_ambient_occlusion_needs_a_plate() -> None:
+    with pytest.raises(UserError, match="plate"):
+        compositor([], floor(), window_light(), "ao")
+
+
+def test_threads_do_not_change_the_picture() -> None:
+    program = (
+        "import sys; sys.path.insert(0, 'tests/renderer')\n"
+        "import hashlib, test_direct as t\n"
+        "j = t.compositor([t.ball((0, .3, 0), .3)], t.room(), t.window_light(), filtered=True)\n"
+        "j.add(3); j.add(5)\n"
+        "print(hashlib.sha256(j.picture().tobytes()).hexdigest())"
+    )
+    found = {
+        subprocess.run(
+            [*prefix, sys.executable, "-c", program], capture_output=True, text=True, check=True
+        ).stdout
+        for prefix in ([], ["taskset", "-c", "0"])
+    }
+    assert len(found) == 1
