@@ -101,10 +101,9 @@ class Composite:
 type Integrator = Literal["path", "direct", "ao"]
 
 
-def even_light(captured: CapturedSet, place: Values) -> CapturedSet:
-    """The same stand-in under an even white sky, whose map was taken at `place`."""
-    white = np.ones((16, 32, 3), np.float32)
-    return CapturedSet(white, np.asarray(place, float), captured.stand_in)
+def even_light(stand_in: StandInMesh | None, place: NDArray[np.float64]) -> CapturedSet:
+    """A stand-in under an even white sky, as if its map had been taken at `place` (3,)."""
+    return CapturedSet(np.ones((16, 32, 3), np.float32), place, stand_in)
 
 
 class Compositor:
@@ -166,7 +165,7 @@ class Compositor:
         if integrator == "ao":
             if plate is None:
                 raise UserError("ambient occlusion has no light to show: it needs a plate")
-            captured = even_light(captured, camera)
+            captured = even_light(captured.stand_in, np.asarray(camera, float))
         self._difference = mode == "difference"
         self._environment = np.ascontiguousarray(captured.environment, np.float32)
         self._plate_samples = plate_samples
@@ -234,7 +233,7 @@ class Compositor:
         """Add `samples` sub-samples to each pixel, or to those of the `rows` (H,) alone."""
         if self._direct is not None:
             if rows is not None:
-                raise UserError("tiles are for the path integrator; `direct` renders whole frames")
+                raise UserError("tiles are for the path integrator: direct makes whole frames")
             for count in [_DIRECT_PASS] * (samples // _DIRECT_PASS) + [samples % _DIRECT_PASS]:
                 if count:
                     self.rays_traced += self._direct.add(self._rays, self._camera, count)
@@ -321,15 +320,14 @@ class Compositor:
         """The composite of the samples so far."""
         if self._direct is not None:
             rgb, layers, clipped = self._resolve(True)
-            alpha, quotient = layers[..., 3], layers[..., 4:7]
             return Composite(
                 rgb=rgb,
-                alpha=alpha,
-                quotient=quotient,
+                alpha=layers[..., 3],
+                quotient=layers[..., 4:7],
                 objects=layers[..., 0:3],
                 standard_error=layers[..., 7],
                 depth=layers[..., 8],
-                changed=(alpha > 0) | (quotient != 1).any(axis=2),
+                changed=(layers[..., 3] > 0) | (layers[..., 4:7] != 1).any(axis=2),
                 clipped=clipped,
             )
         film = self._film

@@ -158,33 +158,48 @@ Direct::Direct(const Compositor& scene, uint64_t seed)
 }
 
 void Direct::objects_moved() {
-  centre_.clear();
+  owners_.clear();
   const World& objects = *scene_.objects_;
-  const bool many = objects.instances() > kMostOwners;
-  Vec3 all;
+  Sphere all{{}, 0};
   for (uint32_t k = 0; k < objects.instances(); ++k) {
-    const Vec3 c = objects.centre(k);
-    all += c * (1 / float(objects.instances()));
-    if (!many) centre_.push_back(c);
+    owners_.push_back(objects.bound(k));
+    all.centre += owners_.back().centre * (1 / float(objects.instances()));
   }
-  if (many) centre_.push_back(all);
-  centre_.push_back(all);
-  lists_ = std::make_unique<LazyList[]>((centre_.size() - 1) * LightLists::kBins +
+  for (const Sphere& s : owners_) {
+    all.radius = std::max(all.radius, length(s.centre - all.centre) + s.radius);
+  }
+  if (owners_.size() > kMostOwners) owners_.assign(1, all);
+  owners_.push_back(all);
+  forget_lists();
+}
+
+void Direct::forget_lists() {
+  lists_ = std::make_unique<LazyList[]>((owners_.size() - 1) * LightLists::kBins +
                                         2 * plane_normal_.size());
 }
 
+// A list is a sample of the light: in the long run its grain has to go as well.
+void Direct::draw_lamps(int epoch) {
+  if (epoch == epoch_) return;
+  epoch_ = epoch;
+  lights_ = LightLists(captured_, seed_ + uint64_t(epoch));
+  forget_lists();
+}
+
 uint32_t Direct::owner_of(uint32_t instance) const {
-  return instance + 1 < centre_.size() ? instance : 0;
+  return instance + 1 < owners_.size() ? instance : 0;
 }
 
 const LightLists::List& Direct::list(uint32_t owner, uint32_t bin) const {
   LazyList& lazy = lists_[size_t(owner) * LightLists::kBins + bin];
   std::call_once(lazy.once, [&] {
-    const bool set = owner + 1 == centre_.size();
+    const bool set = owner + 1 == owners_.size();
     const Vec3 n = set ? plane_normal_[bin / 2] * (bin & 1 ? -1.0f : 1.0f)
                        : LightLists::middle_of(bin);
-    lazy.list = lights_.draw(centre_[owner], n, set ? 0.0f : LightLists::kSlack,
-                             set ? kFloorLamps : kObjectLamps, 0.5f);
+    const Sphere& around = owners_[owner];
+    lazy.list = set ? lights_.draw(around.centre, around.radius, n, 0, kFloorLamps, 0.5f)
+                    : lights_.draw(around.centre, around.radius, n, LightLists::kSlack,
+                                   kObjectLamps, 0.5f);
   });
   return lazy.list;
 }
@@ -222,6 +237,7 @@ void Direct::find_hidable(const LightLists::List& list, Vec3 centre, float radiu
 
 void Direct::begin(int height, int width) {
   height_ = height, width_ = width, passes_ = 0;
+  draw_lamps(0);
   const size_t n = size_t(height) * width, tiles = size_t(tiles_down()) * tiles_across();
   distance_.resize(n), face_.resize(n), object_.resize(n);
   film_.resize(tiles);
@@ -301,7 +317,7 @@ uint64_t Direct::shade(const PixelRays& rays, Vec3 camera, int samples, int x0, 
   const int x1 = std::min(x0 + kTile, width_), y1 = std::min(y0 + kTile, height_);
   const Pair at = passes_ == 0 ? Pair{0.5f, 0.5f, 0} : spread(uint32_t(passes_));
   const StandIn& set = captured_.stand_in();
-  const uint32_t set_lists = uint32_t(centre_.size()) - 1;
+  const uint32_t set_lists = uint32_t(owners_.size()) - 1;
   ShadowRays shadows(*this);
   const bool positional = captured_.positional(), flat = positional && captured_.flat();
   Vec3 above;  // a flat set: its normal, towards the camera
@@ -614,6 +630,7 @@ uint64_t Direct::shade(const PixelRays& rays, Vec3 camera, int samples, int x0, 
 
 uint64_t Direct::pass(const PixelRays& rays, Vec3 camera, int samples) {
   std::atomic<uint64_t> traced{0};
+  draw_lamps(passes_ / kPassesOfLamps);
   const Pair at = passes_ == 0 ? Pair{0.5f, 0.5f, 0} : spread(uint32_t(passes_));
   const int across = tiles_across(), down = tiles_down();
   const auto tiles = [&](auto&& work) {

@@ -36,6 +36,7 @@ class Direct {
 
  private:
   static constexpr int kTile = FilmTile::kSide;
+  static constexpr int kPassesOfLamps = 8;  // then others are drawn
   static constexpr size_t kMostOwners = 32;  // of lists; more objects share theirs
   static constexpr uint32_t kFloorLamps = 2048, kObjectLamps = 1024;
 
@@ -46,6 +47,8 @@ class Direct {
   // The choices that an object may hide from somewhere in the sphere, in their order.
   void find_hidable(const LightLists::List& list, Vec3 centre, float radius,
                     std::vector<uint32_t>& found) const;
+  void draw_lamps(int epoch);
+  void forget_lists();
   const LightLists::List& list(uint32_t owner, uint32_t bin) const;
   bool sees_objects(const PixelRays& rays, Vec3 camera, int x0, int x1, int y0, int y1) const;
   int tiles_across() const { return (width_ + kTile - 1) / kTile; }
@@ -56,7 +59,8 @@ class Direct {
   const Compositor& scene_;
   const Captured& captured_;
   LightLists lights_;
-  std::vector<Vec3> centre_;  // of each object; the last is that of all
+  int epoch_ = 0;  // how many times the lamps were drawn anew
+  std::vector<Sphere> owners_;  // of lists: an object each; the last holds them all, for the set
   struct LazyList {
     std::once_flag once;
     LightLists::List list;

@@ -40,7 +40,7 @@ bool Filter::load(const FilmTile* const (&around)[9], bool objects, int passes) 
 
 void Filter::run(const FilmTile* const (&around)[9], bool objects, int passes, bool filter) {
   if (load(around, objects, passes) && filter) {
-    objects ? smooth<true>() : smooth<false>();
+    objects ? smooth<true>(passes) : smooth<false>(passes);
     return;
   }
   for (int y = 0; y < kTile; ++y) {
@@ -53,7 +53,7 @@ void Filter::run(const FilmTile* const (&around)[9], bool objects, int passes, b
 }
 
 template <bool kGuided>
-void Filter::smooth() {
+void Filter::smooth(int passes) {
   // how alike two places' surfaces are: 0 across surfaces
   const auto alike = [&](int p, int q) {
     const float same = group_[p] == group_[q] ? share_[q] : 0.0f;
@@ -88,7 +88,9 @@ void Filter::smooth() {
   }
 
   constexpr float kWindow = (2 * kMeans + 1) * (2 * kMeans + 1);
-  constexpr float kTolerance = 8 / kWindow;  // of squared differences of means, over variances
+  // Of squared differences of means, over variances. Stratified rays agree ever better than the
+  // variance of single ones says.
+  const float tolerance = 8 / (kWindow * float(passes));
   for (int y = 0; y < kTile; ++y) {
     alignas(64) float sum[4][kTile] = {}, weight[kTile] = {};
     const int row = (y + kApron) * kSide + kApron;
@@ -99,7 +101,7 @@ void Filter::smooth() {
         for (int x = 0; x < kTile; ++x) {
           const int p = row + x, q = p + off;
           const float difference = mean_[p] - mean_[q];
-          const float allowed = kTolerance * (noise_[p] + noise_[q]) + 1e-12f;
+          const float allowed = tolerance * (noise_[p] + noise_[q]) + 1e-12f;
           const float near = std::max(0.0f, 1 - difference * difference / allowed);
           const float w = alike(p, q) * near * near;
           sum[0][x] += w * v_[0][q], sum[1][x] += w * v_[1][q], sum[2][x] += w * v_[2][q];

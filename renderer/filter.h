@@ -39,7 +39,7 @@ class Filter {
   static constexpr int kApron = kReach + kMeans, kSide = kTile + 2 * kApron;
   bool load(const FilmTile* const (&around)[9], bool objects, int passes);
   template <bool kGuided>
-  void smooth();
+  void smooth(int passes);
 
   alignas(64) float v_[3][kSide * kSide], variance_[kSide * kSide], share_[kSide * kSide];
   alignas(64) float n_[3][kSide * kSide], group_[kSide * kSide];

@@ -22,6 +22,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from chromeball.renderer.composite import Integrator
 from chromeball.renderer.render import (
     PASS,
     Budget,
@@ -75,6 +76,7 @@ class Task:
 
     ``frame``: none for a still. ``output``: the EXR of the whole picture, ``%04d`` in it being
     the frame's number; none: ``VIEW.exr`` or ``VIEW.%04d.exr`` in the scene's folder.
+    ``integrator``: another than the scene file's.
     """
 
     scene_file: str
@@ -83,6 +85,7 @@ class Task:
     frame: int | None = None
     tile: Tile | None = None
     output: str | None = None
+    integrator: Integrator | None = None
 
     def __str__(self) -> str:
         frame = "" if self.frame is None else f" frame {self.frame}"
@@ -169,6 +172,11 @@ class _Picture:
         view = next((v for v in scene.view if v.name == task.view), None)
         if view is None:
             raise UserError(f"there is no [[view]] named {task.view!r}", file=file)
+        if task.integrator is not None:
+            render = msgspec.structs.replace(scene.render, integrator=task.integrator)
+            scene = msgspec.structs.replace(scene, render=render)
+        if task.tile is not None and scene.render.integrator != "path":
+            raise UserError("tiles are for the path integrator: direct makes whole frames")
         number = "" if task.frame is None else f".{task.frame:04d}"
         default = file.parent / scene.folder / f"{view.name}{number}.exr"
         target = task.output or os.fspath(default)

@@ -31,22 +31,24 @@ Vec3 LightLists::middle_of(uint32_t bin) {
   return normalize(n);
 }
 
-LightLists::List LightLists::draw(Vec3 x, Vec3 n, float slack, uint32_t count, float u) const {
+LightLists::List LightLists::draw(Vec3 x, float radius, Vec3 n, float slack, uint32_t count,
+                                  float u) const {
   List list;
   std::vector<float> power(lamps_.size());
   double sum = 0;
   for (size_t k = 0; k < lamps_.size(); ++k) {
     const Lamp& lamp = lamps_[k];
     Vec3 d = lamp.place;
-    float share = 1;
+    float share = 1, aside = 0;
     if (lamp.finite) {
       const Vec3 to = lamp.place - x;
       const float nearest = Lamp::kNear * lamp.distance;
       const float x2 = std::max(length2(to), nearest * nearest), t = std::sqrt(x2);
       d = to * (1 / t);
+      aside = radius / t;  // seen from elsewhere in the sphere it may stand higher
       share = lamp.spread(std::min(1.0f, std::abs(dot(d, lamp.n)) + 0.05f), x2);
     }
-    power[k] = mean(lamp.flux) * share * std::max(0.0f, dot(d, n) + slack);
+    power[k] = mean(lamp.flux) * share * std::max(0.0f, dot(d, n) + slack + aside);
     sum += power[k];
   }
   if (!(sum > 0)) return list;

@@ -15,7 +15,7 @@ class LightLists {
  public:
   static constexpr int kGrid = 8;                    // cells along a face of the cube of normals
   static constexpr uint32_t kBins = 6 * kGrid * kGrid;
-  static constexpr float kSlack = 0.16f;  // sine of the widest angle in a cell
+  static constexpr float kSlack = 0.18f;  // sine of the widest angle in a cell
   static constexpr uint32_t kLamps = 8192;
 
   LightLists(const Captured& captured, uint64_t seed);
@@ -35,10 +35,10 @@ class LightLists {
   static uint32_t bin_of(Vec3 n);
   static Vec3 middle_of(uint32_t bin);
 
-  // `count` lamps for surfaces around x with normals near n: drawn in proportion to what they
-  // send there, stratified along the Hilbert curve; `slack` is added to the cosine, for normals
-  // that differ from n.
-  List draw(Vec3 x, Vec3 n, float slack, uint32_t count, float u) const;
+  // `count` lamps for surfaces within `radius` of x with normals near n: drawn in proportion to
+  // what they send there, stratified along the Hilbert curve; `slack` is added to the cosine, for
+  // normals that differ from n.
+  List draw(Vec3 x, float radius, Vec3 n, float slack, uint32_t count, float u) const;
 
  private:
   std::vector<Lamp> lamps_;

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from chromeball.renderer.composite import CapturedSet, Composite, Compositor
+from chromeball.renderer.composite import CapturedSet, Composite, Compositor, even_light
 from chromeball.renderer.exposed import expose
 from chromeball.renderer.look import CameraLook, apply_look, read_look
 from chromeball.renderer.path import corner_rays
@@ -83,12 +83,15 @@ def prepare(scene: Scene, folder: Path, view: View, spp: int) -> Job:
 
     """
     build = folder / scene.folder
-    env_file = build / "env.exr"
-    environment = read_rgb(env_file)
-    if environment.shape[1] != 2 * environment.shape[0]:
-        raise UserError("a lat-long map is twice as wide as high", file=env_file)
-    origin = _origin(env_file)
-    inputs = [env_file]
+    inputs: list[Path] = []
+    environment, origin = None, np.zeros(3)
+    if scene.render.integrator != "ao":
+        env_file = build / "env.exr"
+        environment = read_rgb(env_file)
+        if environment.shape[1] != 2 * environment.shape[0]:
+            raise UserError("a lat-long map is twice as wide as high", file=env_file)
+        origin = _origin(env_file)
+        inputs.append(env_file)
     stand_in = None
     if scene.stand_in:
         inputs.append(build / "stand_in.ply")
@@ -109,16 +112,26 @@ def prepare(scene: Scene, folder: Path, view: View, spp: int) -> Job:
                 f"{plate.shape[1]} x {plate.shape[0]}",
                 file=camera_file,
             )
+    elif environment is None:
+        raise UserError(
+            f"view {view.name!r}: ambient occlusion has no light to show: give it a plate"
+        )
     else:
         camera = virtual_camera(view, origin)
     inputs += [folder / o.mesh for o in scene.object if (folder / o.mesh).is_file()]
-    captured = CapturedSet(environment, origin, stand_in)
+    place = camera.world_from_camera.translation
+    captured = (
+        even_light(stand_in, place)
+        if environment is None
+        else CapturedSet(environment, origin, stand_in)
+    )
     compositor = Compositor(
         object_meshes(scene, folder),
         captured,
         corner_rays(camera),
-        camera.world_from_camera.translation,
+        place,
         plate,
+        integrator=scene.render.integrator,
         bounces=scene.render.bounces,
         mode=scene.render.composite,
         seed=scene.render.seed,

@@ -159,12 +159,15 @@ size_t World::triangles() const {
   return sum;
 }
 
-Vec3 World::centre(uint32_t instance) const {
+Sphere World::bound(uint32_t instance) const {
   const Instance& of = instances_[instance];
   const auto& spheres = meshes_[of.mesh].bounds;
-  Vec3 sum;
-  for (const Sphere& s : spheres) sum += s.centre;
-  return of.to_world.point(sum * (1 / float(std::max<size_t>(1, spheres.size()))));
+  Sphere all{{}, 0};
+  for (const Sphere& s : spheres) all.centre += s.centre * (1 / float(spheres.size()));
+  for (const Sphere& s : spheres) {
+    all.radius = std::max(all.radius, length(s.centre - all.centre) + s.radius);
+  }
+  return {of.to_world.point(all.centre), of.scale * all.radius};
 }
 
 void World::find_bounds() {

@@ -51,7 +51,7 @@ class World {
   size_t instances() const { return instances_.size(); }
   size_t triangles() const;
   bool empty() const { return instances_.empty(); }
-  Vec3 centre(uint32_t instance) const;  // of its bounding spheres' centres
+  Sphere bound(uint32_t instance) const;  // around its bounding spheres
   // Whether any surface lets light straight through.
   bool transmits() const { return transmits_; }
   RTCScene scene() const { return top_.get(); }

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
@@ -32,6 +32,7 @@ def render(
     spp: int | None = None,
     seconds: float | None = None,
     error: float | None = None,
+    integrator: Literal["path", "direct", "ao"] | None = None,
     output: Annotated[Path | None, Parameter(alias="-o")] = None,
     json_: Annotated[bool, Parameter(name="--json", negative="")] = False,
 ) -> None:
@@ -62,6 +63,10 @@ def render(
         Stop after so many seconds.
     error
         Stop when the standard error of the changed pixels, relative to their mean, is below.
+    integrator
+        path: all light between objects and set, the reference. direct: many times faster, the
+        set's light on the objects and their shadows. ao: direct under a white sky, for a plate
+        without a light probe. By default what the scene file says, else path.
     output
         The EXR, by default VIEW.exr in the scene's build folder, VIEW.%04d.exr for frames.
     json_
@@ -90,6 +95,7 @@ def render(
             number,
             part,
             None if output is None else str(output),
+            integrator,
         )
         for number in numbers
         for part in parts

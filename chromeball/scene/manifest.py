@@ -310,8 +310,14 @@ class Calibrate(Table, frozen=True):
 
 
 class Render(Table, frozen=True):
-    """How the objects are rendered into the views."""
+    """How the objects are rendered into the views.
 
+    ``integrator``: ``path`` is the reference, all light between objects and set (``bounces``);
+    ``direct`` the fast one: light of the set on the objects and their shadows; ``ao`` the same
+    under an even white sky, for a plate without a light probe.
+    """
+
+    integrator: Literal["path", "direct", "ao"] = "path"
     spp: Annotated[int, Meta(ge=1)] = 64
     seed: int = 0
     bounces: Annotated[int, Meta(ge=0)] = 2
