@@ -320,6 +320,12 @@ class Compositor:
         """The composite of the samples so far."""
         if self._direct is not None:
             rgb, layers, clipped = self._resolve(True)
+            kept = np.repeat(1 - layers[..., 3:4], 3, axis=2)
+            added = layers[..., 0:3]
+            if self._difference:
+                added = rgb - self.plate * kept
+            else:
+                kept += layers[..., 9:12]
             return Composite(
                 rgb=rgb,
                 alpha=layers[..., 3],
@@ -329,6 +335,8 @@ class Compositor:
                 depth=layers[..., 8],
                 changed=(layers[..., 3] > 0) | (layers[..., 4:7] != 1).any(axis=2),
                 clipped=clipped,
+                kept=kept,
+                added=added,
             )
         film = self._film
         n = np.maximum(film[..., _SAMPLES], 1)

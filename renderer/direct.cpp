@@ -654,10 +654,12 @@ size_t Direct::resolve(const PixelRays& rays, Vec3 camera, const float* plate,
   std::atomic<size_t> clipped{0};
   const int across = tiles_across(), down = tiles_down();
   const float per_pass = 1 / float(std::max(1, passes_));
-  const auto layer = [&](size_t i, Vec3 object, float alpha, Vec3 dq, float error, float depth) {
+  const auto layer = [&](size_t i, Vec3 object, float alpha, Vec3 dq, float error, float depth,
+                         float share) {
     if (!layers) return;
-    const float values[kLayers] = {object.x, object.y, object.z, alpha, 1 + dq.x,
-                                   1 + dq.y, 1 + dq.z, error,    depth};
+    const float values[kLayers] = {
+        object.x, object.y, object.z, alpha,        1 + dq.x,     1 + dq.y,
+        1 + dq.z, error,    depth,    share * dq.x, share * dq.y, share * dq.z};
     std::copy_n(values, kLayers, layers + kLayers * i);
   };
   tbb::parallel_for(0, across * down, [&](int k) {
@@ -672,7 +674,7 @@ size_t Direct::resolve(const PixelRays& rays, Vec3 camera, const float* plate,
         const size_t from = size_t(y) * width_ + x0;
         std::copy_n(plate + 3 * from, 3 * size_t(x1 - x0), rgb + 3 * from);
         for (int x = 0; layers && x < x1 - x0; ++x) {
-          layer(from + x, {}, 0, {}, 0, middle_depth(from + x));
+          layer(from + x, {}, 0, {}, 0, middle_depth(from + x), 0);
         }
       }
       return;
@@ -719,7 +721,7 @@ size_t Direct::resolve(const PixelRays& rays, Vec3 camera, const float* plate,
         }
         rgb[3 * i] = out.x, rgb[3 * i + 1] = out.y, rgb[3 * i + 2] = out.z;
         layer(i, object, alpha, dq, error,
-              film.depth[at] > 0 ? film.depth[at] * per_pass : middle_depth(i));
+              film.depth[at] > 0 ? film.depth[at] * per_pass : middle_depth(i), share);
       }
     }
   });

@@ -26,8 +26,9 @@ class Direct {
   // sub-samples of two shadow rays where a pixel meets an object. Returns rays traced.
   uint64_t pass(const PixelRays& rays, Vec3 camera, int samples);
   // The composite (H, W, 3) of all passes. `layers` (H, W, kLayers), where wanted, gets the mean
-  // of each pixel: objects 3, alpha 1, Q 3, standard error of the brightness 1, depth 1.
-  static constexpr int kLayers = 9;
+  // of each pixel: objects 3, alpha 1, Q 3, standard error of the brightness 1, depth 1, and
+  // (Q - 1) times the set's share of the pixel 3.
+  static constexpr int kLayers = 12;
   // Returns how many pixels would be negative, which are cut at 0.
   size_t resolve(const PixelRays& rays, Vec3 camera, const float* plate, bool difference,
                  bool filter, float* rgb, float* layers) const;

@@ -252,3 +252,14 @@ def test_threads_do_not_change_the_picture() -> None:
         for prefix in ([], ["taskset", "-c", "0"])
     }
     assert len(found) == 1
+
+
+@pytest.mark.parametrize("mode", ["quotient", "difference"])
+def test_what_is_kept_and_what_is_added_make_the_picture(mode: str) -> None:
+    plate = np.random.default_rng(0).uniform(0.1, 1, (SIZE[1], SIZE[0], 3)).astype(np.float32)
+    job = compositor(
+        [ball((0, 0.3, 0), 0.3)], floor(), window_light(), plate=plate, filtered=True, mode=mode
+    )
+    job.add(4)
+    result = job.result()
+    np.testing.assert_allclose(result.kept * plate + result.added, result.rgb, atol=2e-6)
