@@ -316,28 +316,32 @@ class Compositor:
             self._rays, self._camera, self.plate, self._difference, self._filtered, layers
         )
 
+    def _direct_result(self) -> Composite:
+        rgb, layers, clipped = self._resolve(True)
+        objects, alpha, quotient = layers[..., 0:3], layers[..., 3], layers[..., 4:7]
+        kept = _float32(np.repeat(1 - alpha[..., None], 3, axis=2))
+        added = objects
+        if self._difference:
+            added = rgb - self.plate * kept
+        else:
+            kept += layers[..., 9:12]
+        return Composite(
+            rgb=rgb,
+            alpha=alpha,
+            quotient=quotient,
+            objects=objects,
+            standard_error=layers[..., 7],
+            depth=layers[..., 8],
+            changed=(alpha > 0) | (quotient != 1).any(axis=2),
+            clipped=clipped,
+            kept=kept,
+            added=added,
+        )
+
     def result(self) -> Composite:
         """The composite of the samples so far."""
         if self._direct is not None:
-            rgb, layers, clipped = self._resolve(True)
-            kept = np.repeat(1 - layers[..., 3:4], 3, axis=2)
-            added = layers[..., 0:3]
-            if self._difference:
-                added = rgb - self.plate * kept
-            else:
-                kept += layers[..., 9:12]
-            return Composite(
-                rgb=rgb,
-                alpha=layers[..., 3],
-                quotient=layers[..., 4:7],
-                objects=layers[..., 0:3],
-                standard_error=layers[..., 7],
-                depth=layers[..., 8],
-                changed=(layers[..., 3] > 0) | (layers[..., 4:7] != 1).any(axis=2),
-                clipped=clipped,
-                kept=kept,
-                added=added,
-            )
+            return self._direct_result()
         film = self._film
         n = np.maximum(film[..., _SAMPLES], 1)
         alpha = film[..., _COVERAGE] / n
