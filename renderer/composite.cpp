@@ -6,11 +6,11 @@
 namespace chromeball {
 namespace {
 
-constexpr int kMostScatterings = 24;  // a path lost between mirrors ends here, black
+constexpr int kMostScatterings = 128;  // a path lost between mirrors ends here, black
+constexpr int kSureScatterings = 8;  // roulette may end a path after these
 constexpr int kMostPassed = 256;
 
 bool is_one(Vec3 v) { return v.x == 1 && v.y == 1 && v.z == 1; }
-void add(float* to, Vec3 v) { to[0] += v.x, to[1] += v.y, to[2] += v.z; }
 
 }  // namespace
 
@@ -177,6 +177,11 @@ Vec3 Compositor::object_radiance(Hit hit, Vec3 d, int bounces, Path& path) const
     const Scatter next = sample(s, -d, path.sampler);
     beta *= next.weight;
     if (largest(beta) <= 0) return sum;
+    if (k >= kSureScatterings) {  // the root ends fewer, and those it spares stay quiet
+      const float survive = std::min(1.0f, std::sqrt(largest(beta)));
+      if (survive < 1 && path.sampler.pair().x >= survive) return sum;
+      beta *= 1 / survive;
+    }
     d = next.wi;
     const Vec3 o = s.start(d);
     const auto [object, place] = meet(o, d, beta, path);

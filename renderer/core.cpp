@@ -159,6 +159,57 @@ Out hits(const WorldArrays& self, In3f origins, In3f directions) {
   return out.release();
 }
 
+// For tests and plots: what the surface that a ray meets does.
+Surface met(const WorldArrays& self, const std::array<float, 3>& o,
+            const std::array<float, 3>& d) {
+  const Hit hit = self.world.intersect(Vec3(o.data()), Vec3(d.data()));
+  if (!hit) throw nb::value_error("the ray meets nothing");
+  return self.world.surface_at(hit, normalize(Vec3(d.data())));
+}
+
+// f cos (3) and density of directions that leave it: (N, 1, 4).
+Out evaluate(const WorldArrays& self, std::array<float, 3> origin, std::array<float, 3> ray,
+             In3f directions) {
+  const Surface s = met(self, origin, ray);
+  const Vec3 wo = -normalize(Vec3(ray.data()));
+  NewPicture out(directions.shape(0), 1, 4);
+  for (size_t i = 0; i < out.height; ++i) {
+    const Vec3 wi(directions.data() + 3 * i);
+    add(out.data + 4 * i, shade(s, wo, wi));
+    out.data[4 * i + 3] = density(s, wo, wi);
+  }
+  return out.release();
+}
+
+// Directions (3) that it samples, their weight (3), density and whether they blur: (N, 1, 8).
+Out scatter(const WorldArrays& self, std::array<float, 3> origin, std::array<float, 3> ray,
+            uint32_t count, uint64_t seed) {
+  const Surface s = met(self, origin, ray);
+  const SampleTable table(count, seed);
+  NewPicture out(count, 1, 8);
+  for (uint32_t i = 0; i < count; ++i) {
+    Sampler sampler(table, seed, i);
+    const Scatter next = sample(s, -normalize(Vec3(ray.data())), sampler);
+    add(out.data + 8 * i, next.wi);
+    add(out.data + 8 * i + 3, next.weight);
+    out.data[8 * i + 6] = next.density, out.data[8 * i + 7] = next.blurs;
+  }
+  return out.release();
+}
+
+// The share of light that comes straight through along each ray: (N, 1, 3).
+Out transmittance(const WorldArrays& self, In3f origins, In3f directions) {
+  if (origins.shape(0) != directions.shape(0)) {
+    throw nb::value_error("origins and directions differ in length");
+  }
+  NewPicture out(origins.shape(0), 1, 3);
+  for (size_t i = 0; i < out.height; ++i) {
+    add(out.data + 3 * i, self.world.transmittance(Vec3(origins.data() + 3 * i),
+                                                   Vec3(directions.data() + 3 * i)));
+  }
+  return out.release();
+}
+
 }  // namespace
 
 NB_MODULE(core, m) {
@@ -197,7 +248,11 @@ NB_MODULE(core, m) {
           },
           nb::arg("mesh"), nb::arg("matrix"))
       .def("commit", [](WorldArrays& self) { self.world.commit(); })
-      .def("hits", &hits, nb::arg("origins"), nb::arg("directions"));
+      .def("hits", &hits, nb::arg("origins"), nb::arg("directions"))
+      .def("evaluate", &evaluate, nb::arg("origin"), nb::arg("ray"), nb::arg("directions"))
+      .def("scatter", &scatter, nb::arg("origin"), nb::arg("ray"), nb::arg("count"),
+           nb::arg("seed"))
+      .def("transmittance", &transmittance, nb::arg("origins"), nb::arg("directions"));
 
   m.def(
       "path_trace",

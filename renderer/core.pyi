@@ -36,6 +36,22 @@ class World:
     def hits(
         self, origins: NDArray[float32], directions: NDArray[float32]
     ) -> NDArray[float32]: ...
+    def evaluate(
+        self,
+        origin: tuple[float, float, float],
+        ray: tuple[float, float, float],
+        directions: NDArray[float32],
+    ) -> NDArray[float32]: ...
+    def scatter(
+        self,
+        origin: tuple[float, float, float],
+        ray: tuple[float, float, float],
+        count: int,
+        seed: int,
+    ) -> NDArray[float32]: ...
+    def transmittance(
+        self, origins: NDArray[float32], directions: NDArray[float32]
+    ) -> NDArray[float32]: ...
 
 def path_trace(
     world: World,

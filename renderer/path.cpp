@@ -68,7 +68,7 @@ class PathIntegrator {
       }
       if (depth == bounces_) return sum;
       if (!is_specular(s)) {
-        if (irradiance_ && bsdf_density > 0 && s.outside && hit.t > gather_from_) {
+        if (irradiance_ && s.model == Model::diffuse && bsdf_density > 0 && s.outside && hit.t > gather_from_) {
           const Vec3 known = world_.interpolate(irradiance_, hit);
           if (is_finite(known)) return sum + (1 / kPi) * beta * s.base * known;
         }

@@ -53,6 +53,7 @@ inline Vec3 unit_or(Vec3 a, Vec3 otherwise) {
   const float m = largest_magnitude(a);
   return m > 0 && m < 3e38f ? normalize(a * (1 / m)) : otherwise;
 }
+inline void add(float* to, Vec3 v) { to[0] += v.x, to[1] += v.y, to[2] += v.z; }
 inline Vec3 reflect(Vec3 d, Vec3 n) { return d - 2.0f * dot(d, n) * n; }
 
 // An orthonormal basis around n (Duff et al. 2017).

@@ -277,14 +277,15 @@ Surface World::surface_at(const Hit& hit, Vec3 d) const {
   s.roughness = m.roughness;
   if (m.base_texture >= 0) {
     const auto texel = textures_[m.base_texture].at(u, v);
-    s.base *= texel.rgb();
+    for (int k = 0; k < 3; ++k) (&s.base.x)[k] *= std::clamp(texel.c[k], 0.0f, 1.0f);
     s.alpha *= texel.c[3];
   }
   if (m.metallic_roughness_texture >= 0) {
     const auto texel = textures_[m.metallic_roughness_texture].at(u, v);
-    s.roughness *= texel.c[1];
-    s.metallic *= texel.c[2];
+    s.roughness *= std::clamp(texel.c[1], 0.0f, 1.0f);
+    s.metallic *= std::clamp(texel.c[2], 0.0f, 1.0f);
   }
+  s.transmission = m.transmission * (1 - s.metallic);
   if (m.emission_texture >= 0) s.emission *= textures_[m.emission_texture].at(u, v).rgb();
   switch (m.alpha_mode) {
     case AlphaMode::opaque: s.alpha = 1; break;

@@ -10,7 +10,6 @@ import numpy as np
 from chromeball.renderer import core
 from chromeball.renderer.material import Material, Texture, Wrap
 from chromeball.renderer.mesh import Instance, Mesh
-from chromeball.scene.errors import UserError
 
 _ALPHA_MODES = ("opaque", "mask", "blend")
 _WRAPS: tuple[Wrap, ...] = get_args(Wrap.__value__)
@@ -38,7 +37,6 @@ def world(objects: Sequence[Mesh | Instance]) -> core.World:
 
     def material(m: Material) -> int:
         if m not in materials:
-            _check(m)
             materials[m] = built.add_material(
                 base=m.base_color,
                 metallic=m.metallic,
@@ -80,12 +78,3 @@ def world(objects: Sequence[Mesh | Instance]) -> core.World:
         built.place(mesh(instance.mesh), instance.matrix())
     built.commit()
     return built
-
-
-def _check(m: Material) -> None:
-    """Refuse what has no shader yet."""
-    glass = m.transmission == 1 and m.roughness == 0 and not m.thin
-    mirror = m.transmission == 0 and m.metallic == 1 and m.roughness == 0
-    diffuse = m.transmission == 0 and m.metallic == 0 and m.specular == 0
-    if m.clearcoat or m.metallic_roughness_texture or not (glass or mirror or diffuse):
-        raise UserError("a material is neither diffuse, a mirror nor smooth glass: change it")

@@ -1,7 +1,11 @@
 #include "surface.h"
 
+#include "albedo.h"
 #include "diffuse.h"
-#include "specular.h"
+#include "ggx.h"
+#include "glass.h"
+#include "metallic_roughness.h"
+#include "thin_glass.h"
 
 namespace chromeball {
 namespace {
@@ -44,31 +48,84 @@ void settle(Material& m) {
   } else {
     m.model = Model::metallic_roughness;
   }
+  if (m.model == Model::glass && m.roughness >= ggx::kSmooth) {
+    m.glass_in = &GlassAlbedo::get(m.ior);
+    m.glass_out = &GlassAlbedo::get(1 / m.ior);
+  }
   const bool cut = m.alpha_mode != AlphaMode::opaque && (m.alpha < 1 || m.base_texture >= 0);
   m.transmits = cut || m.model == Model::thin_glass;
 }
 
+bool is_clear(const Surface& s) {
+  return s.roughness < ggx::kSmooth || (s.model == Model::glass && s.material->ior < 1.001f);
+}
+
+bool is_specular(const Surface& s) {
+  switch (s.model) {
+    case Model::diffuse: return false;
+    case Model::metallic_roughness: return metallic_roughness::is_specular(s);
+    case Model::glass:
+    case Model::thin_glass: break;
+  }
+  return is_clear(s) &&
+         (s.transmission >= 1 || metallic_roughness::is_specular(s));
+}
+
+// Glass of part transmission is a mixture of glass and an opaque surface.
 Vec3 shade(const Surface& s, Vec3 wo, Vec3 wi) {
-  return s.model == Model::diffuse ? s.alpha * diffuse::shade(s, wo, wi) : Vec3();
+  Vec3 f;
+  switch (s.model) {
+    case Model::diffuse: f = diffuse::shade(s, wo, wi); break;
+    case Model::metallic_roughness: f = metallic_roughness::shade(s, wo, wi); break;
+    case Model::glass: f = s.transmission * glass::shade(s, wo, wi); break;
+    case Model::thin_glass: f = s.transmission * thin_glass::shade(s, wo, wi); break;
+  }
+  if (s.transmission > 0 && s.transmission < 1) {
+    f += (1 - s.transmission) * metallic_roughness::shade(s, wo, wi);
+  }
+  return s.alpha * f;
 }
 
 float density(const Surface& s, Vec3 wo, Vec3 wi) {
-  return s.model == Model::diffuse ? diffuse::density(s, wo, wi) : 0;
+  float p = 0;
+  switch (s.model) {
+    case Model::diffuse: return diffuse::density(s, wo, wi);
+    case Model::metallic_roughness: return metallic_roughness::density(s, wo, wi);
+    case Model::glass: p = s.transmission * glass::density(s, wo, wi); break;
+    case Model::thin_glass: p = s.transmission * thin_glass::density(s, wo, wi); break;
+  }
+  if (s.transmission < 1) p += (1 - s.transmission) * metallic_roughness::density(s, wo, wi);
+  return p;
 }
 
 Scatter sample(const Surface& s, Vec3 wo, Sampler& sampler) {
-  Scatter scatter;
-  switch (s.model) {
-    case Model::diffuse: scatter = diffuse::sample(s, wo, sampler); break;
-    case Model::metallic_roughness: scatter = specular::mirror(s, wo); break;
-    case Model::glass:
-    case Model::thin_glass: scatter = specular::glass(s, wo, sampler.pair().x); break;
+  Scatter out;
+  if (s.model == Model::diffuse) {
+    out = diffuse::sample(s, wo, sampler);
+  } else if (s.model == Model::metallic_roughness) {
+    out = metallic_roughness::sample(s, wo, sampler);
+  } else {
+    const bool clear = s.transmission >= 1 || sampler.pair().x < s.transmission;
+    out = !clear                          ? metallic_roughness::sample(s, wo, sampler)
+          : s.model == Model::glass       ? glass::sample(s, wo, sampler)
+                                          : thin_glass::sample(s, wo, sampler);
+    if (s.transmission < 1 && out.density > 0) {  // either might have given the direction
+      out.density = density(s, wo, out.wi);
+      out.weight = shade(s, wo, out.wi) * (1 / out.density);
+      return out;
+    }
   }
-  if (s.alpha < 1) scatter.weight *= s.alpha;
-  return scatter;
+  if (s.alpha < 1) out.weight *= s.alpha;
+  return out;
 }
 
-Vec3 transmit(const Surface& s, Vec3) { return Vec3(1 - s.alpha); }
+Vec3 transmit(const Surface& s, Vec3 wo) {
+  Vec3 share(1 - s.alpha);
+  if (s.model == Model::thin_glass && s.transmission > 0) {
+    share += (s.alpha * s.transmission) * thin_glass::transmit(s, wo);
+  }
+  return share;
+}
 
 Texture::Texel Texture::at(float u, float v) const {
   const Neighbours x = neighbours(u, width, wrap[0]), y = neighbours(v, height, wrap[1]);

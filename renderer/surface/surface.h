@@ -32,6 +32,8 @@ struct Texture {
 enum class Model : uint8_t { diffuse, metallic_roughness, glass, thin_glass };
 enum class AlphaMode : uint8_t { opaque = 0, mask = 1, blend = 2 };
 
+class GlassAlbedo;
+
 struct Material {
   Vec3 base;
   float metallic, roughness, specular, ior, transmission;
@@ -46,6 +48,7 @@ struct Material {
   Model model = Model::diffuse;
   float power = 0;       // mean radiance
   bool transmits = false;  // some light passes straight through
+  const GlassAlbedo *glass_in = nullptr, *glass_out = nullptr;  // of rough glass
 };
 
 // A place on a surface with its material there, seen by a ray.
@@ -58,12 +61,15 @@ struct Surface {
   Model model;
   float alpha;
   Vec3 base, emission;
-  float metallic, roughness;
+  float metallic, roughness, transmission;
   const Material* material;
 
   // Where a ray in direction d starts, clear of the face.
   Vec3 start(Vec3 d) const { return p + ng * (dot(d, ng) > 0 ? rise : -rise); }
 };
+
+// Glass too smooth, or too much like the air, to spread light.
+bool is_clear(const Surface& s);
 
 struct Scatter {
   Vec3 wi;
@@ -75,7 +81,7 @@ struct Scatter {
 // Chooses the model and what else follows from the parameters.
 void settle(Material& material);
 // A surface that does nothing but send light in certain directions.
-inline bool is_specular(const Surface& s) { return s.model != Model::diffuse; }
+bool is_specular(const Surface& s);
 Vec3 shade(const Surface& s, Vec3 wo, Vec3 wi);
 float density(const Surface& s, Vec3 wo, Vec3 wi);
 Scatter sample(const Surface& s, Vec3 wo, Sampler& sampler);
