@@ -14,68 +14,6 @@ bool is_one(Vec3 v) { return v.x == 1 && v.y == 1 && v.z == 1; }
 
 }  // namespace
 
-// A mixture over the bounding spheres: uniform in each one's cone, or cosine-weighted where the
-// point lies inside a sphere. Spheres below the horizon have no part in it.
-struct Compositor::Cones {
-  static constexpr int kMost = 32;  // more objects share one cone: see the constructor
-  struct Cone {
-    Vec3 axis;
-    float cosine;  // of the half angle
-    float weight;
-    bool inside;
-  };
-  Cone cone[kMost];
-  int count = 0;
-  float weights = 0;
-  Vec3 n;
-
-  Cones(Vec3 x, Vec3 n, const std::vector<Sphere>& bounds) : n(n) {
-    for (const Sphere& s : bounds) {
-      const Vec3 to = s.centre - x;
-      const float height = dot(to, n), distance2 = length2(to), r2 = s.radius * s.radius;
-      if (height <= -s.radius) continue;
-      Cone c{};
-      if (distance2 <= r2 * 1.0001f) {
-        c = {{}, 0, kPi, true};
-      } else {
-        const float distance = std::sqrt(distance2), sine2 = r2 / distance2;
-        const float cosine = std::sqrt(1 - sine2);
-        const float solid_angle = 2 * kPi * sine2 / (1 + cosine);  // 2 pi (1 - cosine)
-        const float rise = std::min(1.0f, height / distance + s.radius / distance);
-        c = {to * (1 / distance), cosine, solid_angle * rise, false};
-      }
-      weights += c.weight;
-      cone[count++] = c;
-    }
-  }
-
-  // u.bits picks the cone, what is left of it and u.y the direction.
-  Vec3 sample(Pair u) const {
-    float left = u.x * weights;
-    int k = 0;
-    while (k + 1 < count && left >= cone[k].weight) left -= cone[k++].weight;
-    const Cone& c = cone[k];
-    const float rest = std::min(left / c.weight, 0x1.fffffep-1f);
-    if (c.inside) return Frame(n).world(sample_cosine(rest, u.y));
-    const float z = 1 - rest * (1 - c.cosine);
-    const float r = std::sqrt(std::max(0.0f, 1 - z * z)), phi = 2 * kPi * u.y;
-    return normalize(Frame(c.axis).world({r * std::cos(phi), r * std::sin(phi), z}));
-  }
-
-  float density(Vec3 d) const {  // 1/sr
-    float sum = 0;
-    for (int k = 0; k < count; ++k) {
-      const Cone& c = cone[k];
-      if (c.inside) {
-        sum += c.weight * std::max(0.0f, dot(d, n)) / kPi;
-      } else if (dot(d, c.axis) >= c.cosine) {
-        sum += c.weight / (2 * kPi * (1 - c.cosine));
-      }
-    }
-    return sum / weights;
-  }
-};
-
 Compositor::Compositor(World& objects, const StandIn& stand_in, const Environment& environment,
                        Vec3 origin, int bounces, uint64_t seed, uint32_t expected_samples)
     : objects_(&objects),
@@ -84,43 +22,21 @@ Compositor::Compositor(World& objects, const StandIn& stand_in, const Environmen
       table_(expected_samples, seed),
       bounces_(bounces),
       seed_(mix64(seed + 0x436f6d70u)) {
-  find_bounds();
+  bounds_ = Bounds(objects_->bounds());
 }
 
 void Compositor::place(World& objects) {
   objects_ = &objects;
-  find_bounds();
+  bounds_ = Bounds(objects_->bounds());
 }
 
 void Compositor::move(uint32_t object, const double* matrix) {
   objects_->move(object, matrix);
-  find_bounds();
-}
-
-void Compositor::find_bounds() {
-  const auto all = objects_->bounds();
-  bounds_.assign(all.begin(), all.end());
-  if (bounds_.size() <= size_t(Cones::kMost)) return;
-  Vec3 low(kInfinity), high(-kInfinity);
-  for (const Sphere& s : bounds_) {
-    const Vec3 r(s.radius), a = s.centre - r, b = s.centre + r;
-    low = {std::min(low.x, a.x), std::min(low.y, a.y), std::min(low.z, a.z)};
-    high = {std::max(high.x, b.x), std::max(high.y, b.y), std::max(high.z, b.z)};
-  }
-  bounds_ = {{0.5f * low + 0.5f * high, 0.5f * length(high - low)}};
-}
-
-bool Compositor::may_hit(Vec3 o, Vec3 d) const {
-  for (const Sphere& s : bounds_) {
-    const Vec3 to = s.centre - o;
-    const float along = dot(to, d), r2 = s.radius * s.radius, distance2 = length2(to);
-    if (distance2 <= r2 || (along > 0 && distance2 - along * along <= r2)) return true;
-  }
-  return false;
+  bounds_ = Bounds(objects_->bounds());
 }
 
 Hit Compositor::meet_object(Vec3 o, Vec3 d, float tfar, Vec3& share, Path& path) const {
-  if (!may_hit(o, d)) return {};
+  if (!bounds_.may_hit(o, d)) return {};
   ++path.rays;
   Hit hit = objects_->intersect(o, d, tfar);
   if (!objects_->transmits()) return hit;
@@ -165,10 +81,14 @@ Compositor::Meeting Compositor::meet(Vec3 o, Vec3 d, Vec3& share, Path& path) co
 // Radiance that an object sends against d. Directions that are certain are always followed;
 // `bounces` counts the interreflections that are left, at -1 only lamps and mirrors are seen.
 Vec3 Compositor::object_radiance(Hit hit, Vec3 d, int bounces, Path& path) const {
-  Vec3 sum, beta(1.0f);
+  Vec3 sum, beta(1.0f), from;
+  float arrived = 0;  // density with which d was chosen at `from`; 0: not against light sampling
   for (int k = 0; k < kMostScatterings; ++k) {
     const Surface s = objects_->surface_at(hit, d);
-    sum += beta * s.emission;
+    if (!is_zero(s.emission)) {
+      const float other = arrived > 0 ? lamp_density(s, hit, from, d) : 0;
+      sum += (other > 0 ? arrived / (arrived + other) : 1) * beta * s.emission;
+    }
     const bool specular = is_specular(s);
     if (!specular) {
       if (bounces < 0) return sum;
@@ -183,7 +103,8 @@ Vec3 Compositor::object_radiance(Hit hit, Vec3 d, int bounces, Path& path) const
       beta *= 1 / survive;
     }
     d = next.wi;
-    const Vec3 o = s.start(d);
+    arrived = next.density;
+    const Vec3 o = from = s.start(d);
     const auto [object, place] = meet(o, d, beta, path);
     hit = object;
     if (!hit) {
@@ -196,15 +117,39 @@ Vec3 Compositor::object_radiance(Hit hit, Vec3 d, int bounces, Path& path) const
   return sum;
 }
 
-// What comes straight from the captured set and is sent on to wo, by light sampling, weighted
-// against the surface's own sampling (the balance heuristic, Veach 1997).
+// The density over solid angle at `from` with which light sampling picks a lamp's place.
+float Compositor::lamp_density(const Surface& s, const Hit& hit, Vec3 from, Vec3 d) const {
+  const float cos = -dot(s.ng, d);
+  return cos > 0 ? objects_->emitter_density(hit) * length2(s.p - from) / cos : 0;
+}
+
+// What comes straight from the captured set and from lamps among the objects and is sent on to
+// wo, by light sampling, weighted against the surface's own (the balance heuristic, Veach 1997).
 Vec3 Compositor::direct_light(const Surface& s, Vec3 wo, int bounces, Path& path) const {
+  Vec3 sum = captured_light(s, wo, bounces, path);
+  if (!objects_->shines()) return sum;
+  const World::Emitter lamp = objects_->sample_emitter(path.sampler.pair());
+  const Vec3 n = dot(lamp.n, s.p - lamp.p) < 0 ? -lamp.n : lamp.n;
+  const Vec3 x = s.start(lamp.p - s.p), to = lamp.p + lamp.rise * n - x;
+  const float t2 = length2(to), t = std::sqrt(t2);
+  const Vec3 d = to * (1 / t);
+  const float cos = -dot(d, n);
+  if (!(cos > 0)) return sum;
+  Vec3 f = shade(s, wo, d);
+  if (is_zero(f)) return sum;
+  path.rays += 2;
+  f *= objects_->transmittance(x, to, 1 - kLift);
+  if (is_zero(f) || captured_.blocked(x, to, 1 - kLift)) return sum;
+  return sum + (1 / (lamp.density * t2 / cos + density(s, wo, d))) * f * lamp.radiance;
+}
+
+Vec3 Compositor::captured_light(const Surface& s, Vec3 wo, int bounces, Path& path) const {
   const auto light = captured_.sample(s.p, path.sampler.pair());
   if (!light) return {};
   Vec3 f = shade(s, wo, light.d);
   if (is_zero(f)) return {};
   const Vec3 x = s.start(light.d);
-  if (may_hit(x, light.d)) {
+  if (bounds_.may_hit(x, light.d)) {
     ++path.rays;
     f *= objects_->transmittance(x, light.d, light.t * (1 - 1e-4f));
     if (is_zero(f)) return {};
@@ -222,35 +167,35 @@ Vec3 Compositor::stand_in_radiance(const Place& place, Vec3 d, int bounces, Path
   return captured * (Vec3(1.0f) + relative_change(place, bounces - 1, false, path));
 }
 
-// (L_with - L_without) cos for a direction whose first hit is an object.
-Vec3 Compositor::change(Vec3 d, float cos, const Hit& hit, Vec3 share, const Place& behind,
-                        int bounces, Path& path) const {
+// (L_with - L_without) cos for a direction whose first hit is an object, over the density with
+// which the strategies together choose it. `share` is what thin surfaces in front let through.
+Vec3 Compositor::change(Vec3 x, Vec3 n, Vec3 d, const Hit& hit, Vec3 share, const Place& behind,
+                        const Cones& cones, float light, int bounces, Path& path) const {
   const Vec3 without = captured_.radiance(behind, d);
-  // what came through thin surfaces to the set is seen there, coloured
-  if (!hit) return cos * (share - Vec3(1.0f)) * without;
-  return cos * (share * object_radiance(hit, d, bounces - 1, path) - without);
+  float density = light + cones.density(d);
+  Vec3 with = share * without;  // only coloured
+  if (hit) {
+    if (objects_->shines()) density += lamp_density(objects_->surface_at(hit, d), hit, x, d);
+    with = share * object_radiance(hit, d, bounces - 1, path);
+  }
+  return (dot(d, n) / density) * (with - without);
 }
 
-Vec3 Compositor::light_change(Vec3 x, Vec3 n, const Cones& cones, float share, int bounces,
+Vec3 Compositor::light_change(Vec3 x, Vec3 n, const Cones& cones, int bounces,
                               Path& path) const {
   const auto light = captured_.sample(x, path.sampler.pair());
-  if (!light) return {};
-  const float cos = dot(light.d, n);
-  if (cos <= 0) return {};
+  if (!light || dot(light.d, n) <= 0) return {};
   Vec3 through(1.0f);
   const Hit hit = meet_object(x, light.d, light.t, through, path);
   if (!hit && is_one(through)) return {};
   const Place behind = meet_stand_in(x, light.d, kInfinity, path);
   if (!Captured::reaches(light, behind)) return {};
-  const float density = share * (light.density + cones.density(light.d));
-  return (1 / density) * change(light.d, cos, hit, through, behind, bounces, path);
+  return change(x, n, light.d, hit, through, behind, cones, light.density, bounces, path);
 }
 
-Vec3 Compositor::cone_change(Vec3 x, Vec3 n, const Cones& cones, float share, int bounces,
+Vec3 Compositor::cone_change(Vec3 x, Vec3 n, Vec3 d, const Cones& cones, int bounces,
                              Path& path) const {
-  const Vec3 d = cones.sample(path.sampler.pair());
-  const float cos = dot(d, n);
-  if (cos <= 0) return {};
+  if (dot(d, n) <= 0) return {};
   Vec3 through(1.0f);
   Place behind;
   if (objects_->transmits()) behind = meet_stand_in(x, d, kInfinity, path);
@@ -258,26 +203,42 @@ Vec3 Compositor::cone_change(Vec3 x, Vec3 n, const Cones& cones, float share, in
   if (!hit && is_one(through)) return {};
   if (!objects_->transmits()) behind = meet_stand_in(x, d, kInfinity, path);
   if (hit && behind.t < hit.t) return {};
-  const float density = share * (captured_.density(x, d, behind) + cones.density(d));
-  return (1 / density) * change(d, cos, hit, through, behind, bounces, path);
+  const float light = captured_.density(x, d, behind);
+  return change(x, n, d, hit, through, behind, cones, light, bounces, path);
 }
 
-// An estimate of dE / E_without, by both strategies or by one of them at random. Nothing is
+// Towards a lamp among the objects; in its light's share alone, what is in front of it is left
+// to the other strategies.
+Vec3 Compositor::lamp_change(Vec3 x, Vec3 n, const Cones& cones, int bounces,
+                             Path& path) const {
+  const World::Emitter lamp = objects_->sample_emitter(path.sampler.pair());
+  const Vec3 to = lamp.p - x, d = unit_or(to, n);
+  if (dot(d, n) <= 0) return {};
+  Vec3 through(1.0f);
+  const Place behind = meet_stand_in(x, d, kInfinity, path);
+  const Hit hit = meet_object(x, d, behind.t, through, path);
+  if (!hit || std::abs(hit.t - length(to)) > 1e-3f * hit.t) return {};
+  const float light = captured_.density(x, d, behind);
+  return change(x, n, d, hit, through, behind, cones, light, bounces, path);
+}
+
+// An estimate of dE / E_without, by all strategies or by one of them at random. Nothing is
 // random where no sample meets an object: it is 0.
-Vec3 Compositor::relative_change(const Place& place, int bounces, bool both, Path& path) const {
-  const Vec3 x = place.start();
-  const Cones cones(x, place.n, bounds_);
-  if (cones.count == 0) return {};
+Vec3 Compositor::relative_change(const Place& place, int bounces, bool all, Path& path) const {
+  const Vec3 x = place.start(), n = place.n;
+  const Cones cones(x, n, bounds_);
+  if (cones.empty()) return {};
+  const bool lamps = objects_->shines();
+  const int strategies = lamps ? 3 : 2;
+  const int one = all ? -1 : std::min(int(path.sampler.pair().x * strategies), strategies - 1);
   Vec3 dE;
-  if (both) {
-    dE = light_change(x, place.n, cones, 1, bounces, path) +
-         cone_change(x, place.n, cones, 1, bounces, path);
-  } else if (path.sampler.pair().x < 0.5f) {
-    dE = light_change(x, place.n, cones, 0.5f, bounces, path);
-  } else {
-    dE = cone_change(x, place.n, cones, 0.5f, bounces, path);
+  if (all || one == 0) dE += light_change(x, n, cones, bounces, path);
+  if (all || one == 1) {
+    dE += cone_change(x, n, cones.sample(path.sampler.pair()), cones, bounces, path);
   }
+  if (lamps && (all || one == 2)) dE += lamp_change(x, n, cones, bounces, path);
   if (is_zero(dE)) return {};
+  if (!all) dE *= float(strategies);
   const Vec3 E = irradiance_.at(place);
   return {E.x > 0 ? dE.x / E.x : 0, E.y > 0 ? dE.y / E.y : 0, E.z > 0 ? dE.z / E.z : 0};
 }

@@ -4,6 +4,7 @@
 #include <atomic>
 #include <vector>
 
+#include "bounds.h"
 #include "captured.h"
 #include "irradiance.h"
 #include "path.h"
@@ -58,10 +59,7 @@ class Compositor {
     Sampler& sampler;
     uint64_t rays = 0;
   };
-  struct Cones;  // the directions from a point to the objects' bounding spheres
 
-  void find_bounds();
-  bool may_hit(Vec3 o, Vec3 d) const;
   // The first object that does not let the ray through; multiplies `share` by what comes through
   // those that do, so that its mean is right.
   Hit meet_object(Vec3 o, Vec3 d, float tfar, Vec3& share, Path& path) const;
@@ -76,17 +74,20 @@ class Compositor {
 
   Vec3 object_radiance(Hit hit, Vec3 d, int bounces, Path& path) const;
   Vec3 direct_light(const Surface& s, Vec3 wo, int bounces, Path& path) const;
+  Vec3 captured_light(const Surface& s, Vec3 wo, int bounces, Path& path) const;
+  float lamp_density(const Surface& s, const Hit& hit, Vec3 from, Vec3 d) const;
   Vec3 stand_in_radiance(const Place& place, Vec3 d, int bounces, Path& path) const;
-  Vec3 change(Vec3 d, float cos, const Hit& hit, Vec3 share, const Place& behind, int bounces,
-              Path& path) const;
-  Vec3 light_change(Vec3 x, Vec3 n, const Cones& cones, float share, int bounces,
-                    Path& path) const;
-  Vec3 cone_change(Vec3 x, Vec3 n, const Cones& cones, float share, int bounces,
-                   Path& path) const;
-  Vec3 relative_change(const Place& place, int bounces, bool both, Path& path) const;
+
+  // The strategies for dE at x on a support with normal n.
+  Vec3 change(Vec3 x, Vec3 n, Vec3 d, const Hit& hit, Vec3 share, const Place& behind,
+              const Cones& cones, float light, int bounces, Path& path) const;
+  Vec3 light_change(Vec3 x, Vec3 n, const Cones& cones, int bounces, Path& path) const;
+  Vec3 cone_change(Vec3 x, Vec3 n, Vec3 d, const Cones& cones, int bounces, Path& path) const;
+  Vec3 lamp_change(Vec3 x, Vec3 n, const Cones& cones, int bounces, Path& path) const;
+  Vec3 relative_change(const Place& place, int bounces, bool all, Path& path) const;
 
   World* objects_;
-  std::vector<Sphere> bounds_;
+  Bounds bounds_;
   Captured captured_;
   Irradiance irradiance_;
   SampleTable table_;

@@ -6,6 +6,8 @@
 namespace chromeball {
 namespace {
 
+constexpr int kSplits = 3;  // at most eight spheres a mesh
+
 Mat3 abs(const Mat3& m) { return {abs(m.x), abs(m.y), abs(m.z)}; }
 
 Mat3 product(const Mat3& a, const Mat3& b) {
@@ -35,6 +37,40 @@ Sphere around(std::span<const float> vertices, std::span<const uint32_t> faces,
   return {centre, std::sqrt(r2)};
 }
 
+// Spheres around parts of a mesh where they are together much smaller than one around it all.
+void split(std::span<const float> vertices, std::span<const uint32_t> faces,
+           std::span<uint32_t> chosen, const Sphere& whole, int depth,
+           std::vector<Sphere>& into) {
+  const auto first = [&](uint32_t f) { return Vec3(&vertices[3 * faces[3 * f]]); };
+  Vec3 low(kInfinity), high(-kInfinity);
+  for (const uint32_t f : chosen) {
+    const Vec3 p = first(f);
+    low = {std::min(low.x, p.x), std::min(low.y, p.y), std::min(low.z, p.z)};
+    high = {std::max(high.x, p.x), std::max(high.y, p.y), std::max(high.z, p.z)};
+  }
+  const Vec3 extent = high - low;
+  const int axis = extent.x >= largest(extent) ? 0 : extent.y >= largest(extent) ? 1 : 2;
+  const float middle = 0.5f * ((&low.x)[axis] + (&high.x)[axis]);
+  const auto cut = std::partition(chosen.begin(), chosen.end(), [&](uint32_t f) {
+    const Vec3 p = first(f);
+    return (&p.x)[axis] < middle;
+  });
+  const size_t count = size_t(cut - chosen.begin());
+  if (depth == 0 || count == 0 || count == chosen.size()) {
+    into.push_back(whole);
+    return;
+  }
+  const auto a = chosen.first(count), b = chosen.subspan(count);
+  const Sphere one = around(vertices, faces, a), other = around(vertices, faces, b);
+  if (one.radius * one.radius + other.radius * other.radius >
+      0.75f * whole.radius * whole.radius) {
+    into.push_back(whole);
+    return;
+  }
+  split(vertices, faces, a, one, depth - 1, into);
+  split(vertices, faces, b, other, depth - 1, into);
+}
+
 }  // namespace
 
 uint32_t World::add(const Texture& texture) {
@@ -60,7 +96,8 @@ uint32_t World::add(const MeshView& view) {
                                       view.faces.size() / 3);
     std::vector<uint32_t> all(mesh.triangles.size);
     std::iota(all.begin(), all.end(), 0);
-    mesh.bounds.push_back(around(view.vertices, view.faces, all));
+    split(view.vertices, view.faces, all, around(view.vertices, view.faces, all), kSplits,
+          mesh.bounds);
   }
   rtcCommitScene(mesh.scene.get());
   device_.check();

@@ -8,6 +8,7 @@
 #include <span>
 #include <vector>
 
+#include "bounds.h"
 #include "embree.h"
 #include "light.h"
 #include "surface/surface.h"
@@ -28,11 +29,6 @@ struct Affine {
   Mat3 linear;
   Vec3 t;
   Vec3 point(Vec3 p) const { return linear * p + t; }
-};
-
-struct Sphere {
-  Vec3 centre;
-  float radius;
 };
 
 class World {

@@ -77,7 +77,7 @@ def evaluate(
 
 
 def grid(n: int = 600) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Directions over the sphere, finest about its poles, and the solid angle (N, 1) of each."""
+    """Directions over the sphere, finest about its poles, and their solid angles (N, 1)."""
     polar = (np.arange(n) + 0.5) / n * math.pi
     phi = (np.arange(n) + 0.5) / n * 2 * math.pi
     polar, phi = (a.ravel() for a in np.meshgrid(polar, phi, indexing="ij"))

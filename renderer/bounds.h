@@ -1,0 +1,82 @@
+// Spheres around the parts of the objects, in a tree, and the cones in which a point sees them.
+#pragma once
+
+#include <span>
+#include <vector>
+
+#include "sampler.h"
+#include "vec.h"
+
+namespace chromeball {
+
+struct Sphere {
+  Vec3 centre;
+  float radius;
+};
+
+class Bounds {
+ public:
+  struct Node {
+    Sphere sphere;
+    uint32_t left = 0, right = 0;  // 0: a leaf
+  };
+  Bounds() = default;
+  explicit Bounds(std::span<const Sphere> spheres);
+
+  bool empty() const { return nodes_.empty(); }
+  std::span<const Sphere> leaves() const { return leaves_; }
+  std::span<const Node> nodes() const { return nodes_; }  // the root first
+  // Whether the ray, d of unit length, may meet any object.
+  bool may_hit(Vec3 o, Vec3 d) const {
+    if (leaves_.size() > kFew) return may_hit_tree(o, d);
+    for (const Sphere& s : leaves_) {
+      if (may_hit(s, o, d)) return true;
+    }
+    return false;
+  }
+
+ private:
+  static constexpr size_t kFew = 8;  // no tree is needed
+  static bool may_hit(const Sphere& s, Vec3 o, Vec3 d) {
+    const Vec3 to = s.centre - o;
+    const float along = dot(to, d), distance2 = length2(to), r2 = s.radius * s.radius;
+    // what rounding may take from the distance between line and centre, seen from far off
+    const float slack = 1e-6f * distance2;
+    return distance2 <= r2 || (along > 0 && distance2 - along * along <= r2 + slack);
+  }
+  bool may_hit_tree(Vec3 o, Vec3 d) const;
+  uint32_t build(std::span<Sphere> spheres);
+
+  std::vector<Node> nodes_;
+  std::vector<Sphere> leaves_;
+};
+
+// A mixture over a cut through the tree: uniform in each sphere's cone, or cosine-weighted where
+// the point lies inside a sphere. The cut is finest where the objects look largest; spheres
+// below the horizon have no part in it.
+class Cones {
+ public:
+  Cones(Vec3 x, Vec3 n, const Bounds& bounds);
+
+  bool empty() const { return count_ == 0; }
+  Vec3 sample(Pair u) const;
+  float density(Vec3 d) const;  // 1/sr
+
+ private:
+  static constexpr int kMost = 32;
+  struct Cone {
+    float x, y, z;  // the axis; no Vec3, whose members would all be set to 0
+    float cosine;  // of the half angle
+    float weight;
+    uint32_t node;
+    bool inside;
+  };
+  void add(Vec3 x, const Sphere& s, uint32_t node);
+
+  Cone cone_[kMost];
+  int count_ = 0;
+  float weights_ = 0;
+  Vec3 n_;
+};
+
+}  // namespace chromeball
