@@ -21,6 +21,22 @@ Bounds::Bounds(std::span<const Sphere> spheres) : leaves_(spheres.begin(), spher
   std::vector<Sphere> sorted(spheres.begin(), spheres.end());
   nodes_.reserve(2 * sorted.size());
   build(sorted);
+  few_ = leaves_;
+  if (leaves_.size() <= kFew) return;
+  // a cut through the tree: the largest sphere gives way to its parts
+  const auto smaller = [this](uint32_t a, uint32_t b) {
+    const Node &x = nodes_[a], &y = nodes_[b];
+    return (x.left ? x.sphere.radius : 0) < (y.left ? y.sphere.radius : 0);
+  };
+  std::vector<uint32_t> cut{0};
+  while (cut.size() < kFew) {
+    const auto largest = std::max_element(cut.begin(), cut.end(), smaller);
+    const Node& node = nodes_[*largest];
+    *largest = node.left;
+    cut.push_back(node.right);
+  }
+  few_.clear();
+  for (const uint32_t k : cut) few_.push_back(nodes_[k].sphere);
 }
 
 uint32_t Bounds::build(std::span<Sphere> spheres) {

@@ -16,6 +16,7 @@ struct Sphere {
 
 class Bounds {
  public:
+  static constexpr size_t kFew = 32;
   struct Node {
     Sphere sphere;
     uint32_t left = 0, right = 0;  // 0: a leaf
@@ -25,10 +26,12 @@ class Bounds {
 
   bool empty() const { return nodes_.empty(); }
   std::span<const Sphere> leaves() const { return leaves_; }
+  // All leaves, or where they are many some spheres around several each.
+  std::span<const Sphere> few() const { return few_; }
   std::span<const Node> nodes() const { return nodes_; }  // the root first
   // Whether the ray, d of unit length, may meet any object.
   bool may_hit(Vec3 o, Vec3 d) const {
-    if (leaves_.size() > kFew) return may_hit_tree(o, d);
+    if (leaves_.size() > kNoTree) return may_hit_tree(o, d);
     for (const Sphere& s : leaves_) {
       if (may_hit(s, o, d)) return true;
     }
@@ -36,7 +39,7 @@ class Bounds {
   }
 
  private:
-  static constexpr size_t kFew = 8;  // no tree is needed
+  static constexpr size_t kNoTree = 8;
   static bool may_hit(const Sphere& s, Vec3 o, Vec3 d) {
     const Vec3 to = s.centre - o;
     const float along = dot(to, d), distance2 = length2(to), r2 = s.radius * s.radius;
@@ -48,7 +51,7 @@ class Bounds {
   uint32_t build(std::span<Sphere> spheres);
 
   std::vector<Node> nodes_;
-  std::vector<Sphere> leaves_;
+  std::vector<Sphere> leaves_, few_;
 };
 
 // A mixture over a cut through the tree: uniform in each sphere's cone, or cosine-weighted where
@@ -63,7 +66,7 @@ class Cones {
   float density(Vec3 d) const;  // 1/sr
 
  private:
-  static constexpr int kMost = 32;
+  static constexpr int kMost = int(Bounds::kFew);
   struct Cone {
     float x, y, z;  // the axis; no Vec3, whose members would all be set to 0
     float cosine;  // of the half angle

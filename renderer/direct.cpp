@@ -209,7 +209,7 @@ void Direct::find_hidable(const LightLists::List& list, Vec3 centre, float radiu
   static thread_local std::vector<uint8_t> keep;
   const size_t n = list.size();
   keep.assign(n, 0);
-  for (const Sphere& s : scene_.bounds_) {
+  for (const Sphere& s : scene_.bounds_.few()) {
     const Vec3 to = s.centre - centre;
     const float wide = s.radius + radius, to2 = length2(to);
     if (to2 <= wide * wide) {
@@ -262,7 +262,7 @@ bool Direct::sees_objects(const PixelRays& rays, Vec3 camera, int x0, int x1, in
   for (int k = 0; k < count; ++k) cos = std::min(cos, dot(axis, edge[k]));
   if (cos < 0.2f) return true;
   const float half = 1.1f * std::acos(std::min(1.0f, cos)) + 1e-4f;
-  for (const Sphere& s : scene_.bounds_) {
+  for (const Sphere& s : scene_.bounds_.few()) {
     const Vec3 to = s.centre - camera;
     const float distance = length(to);
     if (distance <= s.radius) return true;

@@ -103,7 +103,9 @@ def test_a_rods_own_spheres_aim_better_than_one_around_it() -> None:
 @pytest.mark.parametrize("radius", [0.02, 0.3])
 def test_a_lamp_among_the_objects_lights_the_floor(radius: float) -> None:
     height, shine = 1.0, 0.5 / radius**2
-    lamp = ball(Material(specular=0.0, base_color=(0.0, 0.0, 0.0), emission=(shine,) * 3))
+    lamp = ball(
+        Material(specular=0.0, base_color=(0.0, 0.0, 0.0), emission=(shine, shine, shine))
+    )
     rays, at = view((0.6, 0.2, 0), (0, 0, 0), 0.004)
     pose = Pose(np.eye(3), np.array([0, height - radius, 0]))
     captured = CapturedSet(WHITE, np.array([0, 0.5, 0.5]), floor(5))
