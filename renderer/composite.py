@@ -335,7 +335,7 @@ class Compositor:
             changed=(alpha > 0) | (quotient != 1).any(axis=2),
             clipped=clipped,
             kept=kept,
-            added=added,
+            added=_float32(added),
         )
 
     def result(self) -> Composite:
