@@ -51,19 +51,22 @@ void Captured::find_planes() {
 Place Captured::trace(Vec3 o, Vec3 d, float tfar) const {
   if (accel_.empty()) return {};
   const Hit hit = accel_.intersect(o, d, tfar);
-  if (!hit) return {};
+  return hit ? at(hit, d) : Place();
+}
+
+Place Captured::at(const Hit& hit, Vec3 d) const {
   const float w = 1 - hit.u - hit.v;
-  const auto at = [&](auto corner) {
+  const auto mixed = [&](auto corner) {
     return w * corner(0) + hit.u * corner(1) + hit.v * corner(2);
   };
   Place place;
   place.t = hit.t;
   place.face = hit.face;
-  place.p = at([&](int k) { return stand_in_.corner(hit.face, k); });
-  place.captured_at = at([&](int k) { return stand_in_.original_corner(hit.face, k); });
+  place.p = mixed([&](int k) { return stand_in_.corner(hit.face, k); });
+  place.captured_at = mixed([&](int k) { return stand_in_.original_corner(hit.face, k); });
   const Vec3 n = stand_in_.normal(hit.face);
   place.n = dot(n, d) < 0 ? n : -n;
-  place.rise = rise(at([&](int k) { return abs(stand_in_.corner(hit.face, k)); }) +
+  place.rise = rise(mixed([&](int k) { return abs(stand_in_.corner(hit.face, k)); }) +
                         abs(place.p), n);
   place.support = stand_in_.surface[hit.face] == 0;
   return place;

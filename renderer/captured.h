@@ -79,6 +79,7 @@ class Captured {
   Captured(const StandIn& stand_in, const Environment& environment, Vec3 origin, uint64_t seed);
 
   Place trace(Vec3 o, Vec3 d, float tfar = kInfinity) const;
+  Place at(const Hit& hit, Vec3 d) const;  // where that ray met the set
   bool blocked(Vec3 o, Vec3 d, float tfar) const { return accel_.occluded(o, d, tfar); }
   bool positional() const { return !accel_.empty(); }
   const StandIn& stand_in() const { return stand_in_; }

@@ -37,6 +37,11 @@ float clearance(Vec3 x, Vec3 o) {
   return 8 * kLift * (largest_magnitude(x) + largest_magnitude(x - o));
 }
 
+// By channel; 0 where there is nothing to divide by.
+Vec3 over(Vec3 a, Vec3 b) {
+  return {b.x > 0 ? a.x / b.x : 0, b.y > 0 ? a.y / b.y : 0, b.z > 0 ? a.z / b.z : 0};
+}
+
 float fraction(float x) { return x - std::floor(x); }
 
 // Neighbours in 4 x 4 pixels look at different lamps; the filter joins what they see.
@@ -140,8 +145,122 @@ struct Direct::ShadowRays {
   }
 };
 
+// Rays that look for light by themselves: for what is near in the set, and for what objects and
+// set send each other; there each asks one lamp, and `near` for what is near.
+struct Direct::GatherRays {
+  const Direct& direct;
+  ShadowRays& shadows;
+  GatherRays* near;  // none: these rays see nothing but what is near in the set
+  Packet packet{};
+  int count = 0;
+  uint64_t traced = 0;
+  struct Asker {
+    Vec3* sum;
+    Vec3* square;
+    Vec3 weight;     // of the radiance that is found
+    float u;         // picks the lamp
+    Pair v;          // picks a direction
+    bool from_object;
+  } asker[Packet::kWidth];
+
+  GatherRays(const Direct& direct, ShadowRays& shadows, GatherRays* near)
+      : direct(direct), shadows(shadows), near(near) {}
+
+  void push(Vec3 o, Vec3 d, const Asker& who) {
+    packet.set(count, o, d);
+    asker[count] = who;
+    if (++count == Packet::kWidth) flush();
+  }
+
+  void flush() {
+    if (count == 0) return;
+    const World& objects = *direct.scene_.objects_;
+    traced += uint64_t(count);
+    intersect(objects.scene(), packet, false);
+    Hit hits[Packet::kWidth];
+    int left = 0;
+    for (int k = 0; k < count; ++k) {
+      if (packet.hits(k)) hits[k] = packet.hit(k);
+      packet.forget_hit(k);
+      packet.valid[k] = direct.captured_.positional() && direct.set_matters(packet, k) ? -1 : 0;
+      left += packet.valid[k] != 0;
+    }
+    if (left) {
+      traced += uint64_t(left);
+      intersect(direct.captured_.accel().scene(), packet, false);
+    }
+    for (int k = 0; k < count; ++k) {
+      const bool on_set = packet.valid[k] && packet.hits(k);
+      const Vec3 d = packet.direction(k);
+      if (on_set) {
+        if (asker[k].from_object) meet_set(asker[k], direct.captured_.at(packet.hit(k), d), d);
+      } else if (hits[k] && near) {
+        meet_object(asker[k], hits[k], d);
+      }
+    }
+    packet.clear();
+    count = 0;
+  }
+
+  // What an object sends back: its own light, and that of one lamp.
+  void meet_object(const Asker& a, const Hit& hit, Vec3 d) {
+    const World& objects = *direct.scene_.objects_;
+    const Surface s = objects.surface_at(hit, d);
+    give(a, a.weight * s.emission);
+    if (!direct.bounces_ || s.model != Model::diffuse) return;
+    const Vec3 start = s.p + s.rise * s.ng;
+    if (direct.captured_.positional()) {
+      const Vec3 look = Frame(s.ns).world(sample_cosine(a.v.x, a.v.y));
+      if (dot(look, s.ng) > 0) {
+        near->push(start, look, {a.sum, a.square, a.weight * s.base, 0, {}, true});
+      }
+    }
+    const LightLists::List& list =
+        direct.list(direct.owner_of(hit.instance), LightLists::bin_of(s.ns));
+    if (!list.size()) return;
+    const auto& c = list.choices[std::min(list.size() - 1, size_t(a.u * float(list.size())))];
+    const Lamp::Incident in = direct.lights_.lamp(c.lamp).incident(start);
+    const float cos = dot(in.d, s.ns);
+    if (cos <= 0 || in.share == 0 || dot(in.d, s.ng) <= 0) return;
+    const Vec3 light =
+        (in.share * cos * float(list.size()) / kPi) * a.weight * s.base * c.flux;
+    shadows.push(start, in.d, in.t * (1 - 1e-3f), {a.sum, a.square, light, false, true});
+  }
+
+  // What is near in the set, and what the objects' shadow takes from it.
+  void meet_set(const Asker& a, const Place& place, Vec3 d) {
+    const bool is_near = place.t < Lamp::kNear * direct.captured_.distance(place);
+    const bool shadowed = near && direct.bounces_ && place.support;
+    if (!is_near && !shadowed) return;
+    const Vec3 light = a.weight * direct.captured_.radiance(place, d);
+    if (is_near) give(a, light);
+    if (!shadowed) return;
+    const uint32_t plane = direct.plane_at(place.face, d);
+    const LightLists::List& list = direct.list(direct.set_lists(), plane);
+    if (!list.size()) return;
+    const auto& c = list.choices[std::min(list.size() - 1, size_t(a.u * float(list.size())))];
+    const Vec3 start = place.start();
+    const Lamp::Incident in = direct.lights_.lamp(c.lamp).incident(start);
+    const float cos = dot(in.d, place.n);
+    if (cos <= 0 || in.share == 0 || !direct.scene_.bounds_.may_hit(start, in.d)) return;
+    const Vec3 taken = over((in.share * cos * float(list.size())) * light * c.flux,
+                            direct.scene_.irradiance_.at(place));
+    shadows.push(start, in.d, in.t * (1 - 1e-3f), {a.sum, a.square, taken, true, true});
+  }
+
+  static void give(const Asker& a, Vec3 light) {
+    if (is_zero(light)) return;
+    *a.sum += light;
+    *a.square += light * light;
+  }
+};
+
 Direct::Direct(const Compositor& scene, uint64_t seed)
-    : scene_(scene), captured_(scene.captured_), lights_(scene.captured_, seed), seed_(seed) {
+    : scene_(scene),
+      captured_(scene.captured_),
+      lights_(scene.captured_, seed),
+      bounces_(scene.bounces_ > 0),
+      seed_(seed) {
   // large planes of the set get a list that is drawn for their very normal
   const StandIn& set = captured_.stand_in();
   plane_of_.resize(set.size());
@@ -184,6 +303,26 @@ void Direct::draw_lamps(int epoch) {
   epoch_ = epoch;
   lights_ = LightLists(captured_, seed_ + uint64_t(epoch));
   forget_lists();
+}
+
+// The side of the plane that the ray sees.
+uint32_t Direct::plane_at(uint32_t face, Vec3 d) const {
+  const uint32_t plane = plane_of_[face];
+  return plane + (dot(plane_normal_[plane / 2], d) > 0);
+}
+
+Vec3 Direct::normal_of(uint32_t plane) const {
+  return plane & 1 ? -plane_normal_[plane / 2] : plane_normal_[plane / 2];
+}
+
+// Whether the set may lie before what the lane's ray has met: a single plane that it does not
+// cross before cannot.
+bool Direct::set_matters(const Packet& packet, int lane) const {
+  if (!captured_.flat()) return true;
+  const Vec3 n = plane_normal_[0];
+  const float t = dot(captured_.stand_in().corner(0, 0) - packet.origin(lane), n) /
+                  dot(packet.direction(lane), n);
+  return t > 0 && t < packet.rays.ray.tfar[lane];
 }
 
 uint32_t Direct::owner_of(uint32_t instance) const {
@@ -319,6 +458,8 @@ uint64_t Direct::shade(const PixelRays& rays, Vec3 camera, int samples, int x0, 
   const StandIn& set = captured_.stand_in();
   const uint32_t set_lists = uint32_t(owners_.size()) - 1;
   ShadowRays shadows(*this);
+  GatherRays near(*this, shadows, nullptr), gather(*this, shadows, &near);
+  const bool gathers = bounces_ || scene_.objects_->shines();  // objects light the set
   const bool positional = captured_.positional(), flat = positional && captured_.flat();
   Vec3 above;  // a flat set: its normal, towards the camera
   if (flat) {
@@ -332,13 +473,6 @@ uint64_t Direct::shade(const PixelRays& rays, Vec3 camera, int samples, int x0, 
       }
     }
     return false;
-  };
-  const auto plane_at = [&](uint32_t face, Vec3 d) {  // the side that the ray sees
-    const uint32_t plane = plane_of_[face];
-    return plane + (dot(plane_normal_[plane / 2], d) > 0);
-  };
-  const auto normal_of = [&](uint32_t plane) {
-    return plane & 1 ? -plane_normal_[plane / 2] : plane_normal_[plane / 2];
   };
   const auto group_at = [&](uint32_t plane) -> Tile::Group& {
     for (size_t k = 0; k < tile.count; ++k) {
@@ -400,6 +534,8 @@ uint64_t Direct::shade(const PixelRays& rays, Vec3 camera, int samples, int x0, 
   };
   static thread_local std::vector<Sums> sums;
   sums.assign(tile.receivers.size(), {});
+  static thread_local std::vector<Sums> sent;  // by objects
+  sent.assign(tile.receivers.size(), {});
   const auto ask = [&](const Tile::Group& g, Vec3 x, float u, Vec3* sum, Vec3* square) {
     const size_t m = g.choices.size();
     const auto& c = g.list->choices[g.choices[std::min(m - 1, size_t(u * float(m)))]];
@@ -439,6 +575,38 @@ uint64_t Direct::shade(const PixelRays& rays, Vec3 camera, int samples, int x0, 
     }
     if (!asked) break;
   }
+  // directions of a second leg, apart from those of the first
+  const auto another = [&](uint32_t i, int px, int py) {
+    const Pair a = spread(3 * i + 1);
+    return Pair{fraction(a.x + turn(py + 3, px)), fraction(a.y + turn(px + 3, py + 2)), 0};
+  };
+  const auto seek = [&](const Tile::Sample& s) {
+    return another(uint32_t(passes_ * samples + s.i), int(s.pixel % width_),
+                   int(s.pixel / width_));
+  };
+  const auto look_at_objects = [&](Vec3 x, Vec3 n, Pair u, float lamp, Pair v, Vec3* sum,
+                                   Vec3* square) {
+    const Vec3 start = x + clearance(x, camera) * n;
+    const Cones cones(start, n, scene_.bounds_);
+    if (cones.empty()) return;
+    const Vec3 d = cones.sample(u);
+    const float cos = dot(d, n);
+    if (cos <= 0) return;
+    gather.push(start, d, {sum, square, Vec3(cos / cones.density(d)), lamp, v, false});
+  };
+  if (gathers) {
+    for (size_t k = 0; k < tile.receivers.size(); ++k) {
+      const Tile::Receiver& r = tile.receivers[k];
+      if (r.pixel == kNowhere) continue;
+      const int px = int(r.pixel % width_), py = int(r.pixel / width_);
+      const Pair a = spread(uint32_t(passes_));
+      const Pair u{fraction(a.x + turn(px, py + 1)), fraction(a.y + turn(py, px)), 0};
+      look_at_objects(r.x, normal_of(r.plane), u, fraction(turn(px + 1, py) + pass_turn),
+                      another(uint32_t(passes_), px, py), &sent[k].sum, &sent[k].square);
+    }
+  }
+  gather.flush();
+  near.flush();
   shadows.flush();
 
   // E is smooth: one value for 4 x 4 pixels of a plane
@@ -457,14 +625,12 @@ uint64_t Direct::shade(const PixelRays& rays, Vec3 camera, int samples, int x0, 
     }
     return cell.E;
   };
-  const auto over = [](Vec3 a, Vec3 b) {
-    return Vec3(b.x > 0 ? a.x / b.x : 0, b.y > 0 ? a.y / b.y : 0, b.z > 0 ? a.z / b.z : 0);
-  };
   const size_t number = size_t(y0 / kTile) * tiles_across() + x0 / kTile;
   bool anything = !tile.samples.empty();
+  for (const Sums& one : sent) anything |= !is_zero(one.sum);
   for (size_t k = 0; k < tile.count; ++k) anything |= !tile.groups[k].choices.empty();
   if (!touched_[number]) {
-    if (!anything) return shadows.traced;
+    if (!anything) return shadows.traced + gather.traced + near.traced;
     if (!film_[number]) film_[number] = std::make_unique<FilmTile>();
     *film_[number] = {};
     touched_[number] = 1;
@@ -483,10 +649,17 @@ uint64_t Direct::shade(const PixelRays& rays, Vec3 camera, int samples, int x0, 
     const int at = film_pixel(i);
     film.set.share[at] += 1;
     film.set.group[at] = float(r.plane + 1);
+    const bool changes = !is_zero(sent[k].sum);
+    if (g.choices.empty() && !changes) continue;
+    const Vec3 E = irradiance(i, face_[i], r.x, r.plane);
+    if (changes) {
+      const Vec3 q = over(sent[k].sum, E);
+      film.set.r[at] += q.x, film.set.g[at] += q.y, film.set.b[at] += q.z;
+      film.set.variance[at] += mean(q) * mean(q);
+    }
     if (g.choices.empty()) continue;
     const Share share = share_of(g);
     const float n = float(share.rays) * share.part;
-    const Vec3 E = irradiance(i, face_[i], r.x, r.plane);
     const Vec3 q = over(sums[k].sum, E) * (1 / n);
     film.set.r[at] += q.x, film.set.g[at] += q.y, film.set.b[at] += q.z;
     const float m = mean(q), square = mean(over(over(sums[k].square, E), E)) / n;
@@ -511,12 +684,7 @@ uint64_t Direct::shade(const PixelRays& rays, Vec3 camera, int samples, int x0, 
     for (int k = 0; k < count; ++k) {
       if (packet.hits(k)) hits[k] = packet.hit(k);
       packet.forget_hit(k);
-      // a plane behind the object cannot hide it
-      const float before = flat ? dot(set.corner(0, 0) - camera, above) /
-                                      dot(tile.samples[first + k].d, above)
-                                : 0;
-      const bool hidden_by_none = flat && hits[k] && !(before > 0 && before < hits[k].t);
-      packet.valid[k] = positional && !hidden_by_none ? -1 : 0;
+      packet.valid[k] = positional && set_matters(packet, k) ? -1 : 0;
       left += packet.valid[k] != 0;
     }
     if (left) intersect(captured_.accel().scene(), packet, true), traced += left;
@@ -560,18 +728,14 @@ uint64_t Direct::shade(const PixelRays& rays, Vec3 camera, int samples, int x0, 
           shadows.push(start, in.d, in.t * (1 - 1e-3f),
                        {&s.value, &s.square, light, false, set_may_hide});
         }
-        // what is near in the set, by a ray that looks for it
-        if (positional) {
+        // what is near in the set, and what objects and set send each other
+        if (positional || gathers) {
           const Pair a = spread(uint32_t(passes_ * samples + s.i));
           const Vec3 d = Frame(s.n).world(sample_cosine(fraction(a.x + turn(py, px + 1)),
                                                         fraction(a.y + turn(px + 2, py))));
-          if (dot(d, surface.ng) > 0 && !(flat && dot(d, above) >= 0)) {
-            ++traced;
-            const Place place = captured_.trace(start, d);
-            if (place && place.t < Lamp::kNear * captured_.distance(place)) {
-              shadows.push(start, d, place.t * (1 - 1e-3f),
-                           {&s.value, &s.square, kPi * captured_.radiance(place, d), false, false});
-            }
+          if (dot(d, surface.ng) > 0) {
+            const float u = fraction(shift + 0.618034f * float(s.i) + 0.5f);
+            gather.push(start, d, {&s.value, &s.square, Vec3(kPi), u, seek(s), true});
           }
         }
       } else if (face[k] != kNowhere && set.surface[face[k]] == 0) {
@@ -587,9 +751,19 @@ uint64_t Direct::shade(const PixelRays& rays, Vec3 camera, int samples, int x0, 
             ask(g, camera + s.t * s.d, (float(j) + shift) / float(s.rays), &s.value, &s.square);
           }
         }
+        if (gathers) {
+          const int px = int(s.pixel % width_), py = int(s.pixel / width_);
+          const Pair a = spread(uint32_t(passes_ * samples + s.i));
+          const Pair u{fraction(a.x + turn(px, py + 1)), fraction(a.y + turn(py, px)), 0};
+          look_at_objects(camera + s.t * s.d, normal_of(plane), u,
+                          fraction(turn(px + 1, py) + pass_turn + 0.618034f * float(s.i)), seek(s),
+                          &s.other, &s.square);
+        }
       }
     }
   }
+  gather.flush();
+  near.flush();
   shadows.flush();
   std::fill(std::begin(tile.on_set), std::end(tile.on_set), Moments{});
   std::fill(std::begin(tile.on_object), std::end(tile.on_object), Moments{});
@@ -613,9 +787,9 @@ uint64_t Direct::shade(const PixelRays& rays, Vec3 camera, int samples, int x0, 
         const uint32_t plane = plane_at(s.group, s.d);
         film.set.share[at] += whole;
         film.set.group[at] = float(plane + 1);
-        if (s.rays) {
+        if (s.rays || !is_zero(s.other)) {
           const Vec3 E = irradiance(s.pixel, s.group, camera + s.t * s.d, plane);
-          const Vec3 q = over(s.value, E) * (1 / float(s.rays));
+          const Vec3 q = over(s.value, E) * (1 / float(std::max(1, s.rays))) + over(s.other, E);
           film.set.r[at] += whole * q.x, film.set.g[at] += whole * q.y, film.set.b[at] += whole * q.z;
           tile.on_set[at].add(mean(q));
         }
@@ -625,7 +799,7 @@ uint64_t Direct::shade(const PixelRays& rays, Vec3 camera, int samples, int x0, 
     film.set.variance[at] += tile.on_set[at].of_mean();
     film.objects.variance[at] += tile.on_object[at].of_mean();
   }
-  return traced + shadows.traced;
+  return traced + shadows.traced + gather.traced + near.traced;
 }
 
 uint64_t Direct::pass(const PixelRays& rays, Vec3 camera, int samples) {

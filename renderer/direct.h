@@ -11,6 +11,7 @@
 #include "composite.h"
 #include "filter.h"
 #include "light_list.h"
+#include "packet.h"
 
 namespace chromeball {
 
@@ -44,6 +45,11 @@ class Direct {
   uint32_t owner_of(uint32_t instance) const;
   struct Tile;      // what is known of a tile while it is shaded
   struct ShadowRays;
+  struct GatherRays;
+  uint32_t plane_at(uint32_t face, Vec3 d) const;
+  Vec3 normal_of(uint32_t plane) const;
+  uint32_t set_lists() const { return uint32_t(owners_.size()) - 1; }
+  bool set_matters(const Packet& packet, int lane) const;
 
   // The choices that an object may hide from somewhere in the sphere, in their order.
   void find_hidable(const LightLists::List& list, Vec3 centre, float radius,
@@ -60,6 +66,7 @@ class Direct {
   const Compositor& scene_;
   const Captured& captured_;
   LightLists lights_;
+  bool bounces_;   // whether objects and set light each other, once
   int epoch_ = 0;  // how many times the lamps were drawn anew
   std::vector<Sphere> owners_;  // of lists: an object each; the last holds them all, for the set
   struct LazyList {

@@ -77,6 +77,7 @@ def compositor(
     plate: NDArray[np.float32] | None = None,
     filtered: bool = False,
     view: CameraModel | None = None,
+    bounces: int = 0,
     **options: Any,
 ) -> Compositor:
     view = view or view_from((0.0, 1.4, 1.9))
@@ -86,7 +87,7 @@ def compositor(
         corner_rays(view),
         view.world_from_camera.translation,
         plate,
-        bounces=0,
+        bounces=bounces,
         seed=seed,
         integrator=integrator,
         filtered=filtered,
@@ -115,14 +116,15 @@ def test_the_filter_does_not_touch_what_no_object_can_reach() -> None:
     assert (result.rgb[kept] == plate[kept]).all()
 
 
+@pytest.mark.parametrize("bounces", [0, 1])
 @pytest.mark.parametrize("where", ["floor", "room"])
-def test_direct_and_path_agree(where: str) -> None:
+def test_direct_and_path_agree(where: str, bounces: int) -> None:
     objects = [ball((0.1, 0.25, 0.2), 0.25), ball((-0.5, 0.15, 0.6), 0.15)]
     stand_in = floor() if where == "floor" else room()
     environment = window_light()
-    truth = compositor(objects, stand_in, environment, "path", samples=1024)
+    truth = compositor(objects, stand_in, environment, "path", samples=1024, bounces=bounces)
     truth.add(1024)
-    fast = compositor(objects, stand_in, environment, seed=3)
+    fast = compositor(objects, stand_in, environment, seed=3, bounces=bounces)
     fast.add(512)
     a, b = truth.result(), fast.result()
     assert float(np.abs(a.alpha - b.alpha).max()) < 0.05
