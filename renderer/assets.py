@@ -11,8 +11,8 @@ import numpy as np
 
 from chromeball.renderer.part import Part, checked, smooth
 from chromeball.renderer.primitives import PRIMITIVES
-from chromeball.renderer.read_gltf import gltf_files, read_gltf
-from chromeball.renderer.read_obj import mtl_files, read_obj
+from chromeball.renderer.read_gltf import read_gltf
+from chromeball.renderer.read_obj import read_obj
 from chromeball.renderer.read_ply import read_ply
 from chromeball.scene.errors import UserError
 
@@ -58,23 +58,6 @@ def read_parts(path: str | os.PathLike[str], smooth_angle: float | None = None) 
         raise UserError("the mesh does not fit into memory", file=path) from error
     except OSError as error:
         raise UserError(f"cannot read: {error.strerror}", file=path) from error
-
-
-def mesh_inputs(path: Path) -> list[Path]:
-    """The files that a mesh file is made of, itself first: buffers, materials, images."""
-    if not path.is_file():
-        return [path]
-    try:
-        match path.suffix.lower():
-            case ".gltf":
-                others = gltf_files(path)
-            case ".obj":
-                others = mtl_files(path)
-            case _:
-                others = []
-    except (ValueError, OSError):  # broken: the reader says so
-        others = []
-    return [path, *dict.fromkeys(others)]
 
 
 def _read_meshlab(path: Path) -> list[Part]:

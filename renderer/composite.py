@@ -169,6 +169,7 @@ class Compositor:
         self._difference = mode == "difference"
         self._environment = np.ascontiguousarray(captured.environment, np.float32)
         self._plate_samples = plate_samples
+        self._inner = _inner(objects)
         self._core = core.Compositor(
             world(objects),
             _core_stand_in(captured.stand_in),
@@ -205,15 +206,17 @@ class Compositor:
     def place(self, objects: Sequence[Mesh | Instance]) -> None:
         """Start over with other objects; camera, plate and captured set stay as they are."""
         self._core.place(world(objects))
+        self._inner = _inner(objects)
         self._moved()
 
     def move(self, k: int, pose: Pose, scale: Values = 1.0) -> None:
         """Start over with object `k` elsewhere; no mesh is built again.
 
         `pose` and `scale` (one factor or three) apply to the mesh's vertices, as in
-        :class:`Instance`. Raises IndexError where there is no such object.
+        :class:`Instance`, whose ``inner`` stays. Raises IndexError where there is no such
+        object.
         """
-        self._core.move(k, affine(pose, scale))
+        self._core.move(k, affine(pose, scale, self._inner[k]))
         self._moved()
 
     def _moved(self) -> None:
@@ -394,6 +397,10 @@ def _triple(value: Values) -> tuple[float, float, float]:
 
 def _float32(values: NDArray[np.floating]) -> NDArray[np.float32]:
     return values.astype(np.float32, copy=False)
+
+
+def _inner(objects: Sequence[Mesh | Instance]) -> list[NDArray[np.float64] | None]:
+    return [thing.inner if isinstance(thing, Instance) else None for thing in objects]
 
 
 def check_environment(environment: NDArray[np.float32]) -> None:

@@ -4,10 +4,15 @@
 
 from __future__ import annotations
 
+import struct
+import urllib.parse
+from pathlib import Path
 from typing import Any, Literal
 
 import msgspec
 from msgspec import Struct
+
+from chromeball.scene.errors import UserError
 
 type Three = tuple[float, float, float]
 type Four = tuple[float, float, float, float]
@@ -212,3 +217,80 @@ class Document(Record, frozen=True):
     buffer_views: list[View] = []
     buffers: list[Buffer] = []
     extensions_required: list[str] = []
+
+
+_SUPPORTED = {
+    "EXT_mesh_gpu_instancing",
+    "EXT_texture_webp",
+    "KHR_materials_clearcoat",
+    "KHR_materials_emissive_strength",
+    "KHR_materials_ior",
+    "KHR_materials_specular",
+    "KHR_materials_transmission",
+    "KHR_materials_volume",
+    "KHR_mesh_quantization",
+    "KHR_texture_transform",
+}
+_JSON_CHUNK, _BINARY_CHUNK = 0x4E4F534A, 0x004E4942
+
+
+def named_files(path: Path) -> list[Path]:
+    """The buffers and images that a glTF file names, without reading them."""
+    document, _ = open_document(path)
+    uris = [b.uri for b in document.buffers] + [i.uri for i in document.images]
+    return [external(path, uri) for uri in uris if uri and not uri.startswith("data:")]
+
+
+def open_document(path: Path) -> tuple[Document, bytes | None]:
+    """The JSON part and, of a .glb, the binary chunk.
+
+    Raises
+    ------
+    UserError
+        When it is of another version, truncated, or needs what is not read here; besides
+        msgspec.DecodeError and ValueError for what is no JSON of this kind.
+
+    """
+    data = path.read_bytes()
+    binary: bytes | None = None
+    if data.startswith(b"glTF"):
+        data, binary = _chunks(data)
+    document = msgspec.json.decode(data, type=Document)
+    if not document.asset.version.startswith("2."):
+        raise UserError(f"glTF version {document.asset.version:.20}; export it as 2.0")
+    unknown = [e for e in document.extensions_required if e not in _SUPPORTED]
+    if unknown:
+        raise UserError(f"it needs {', '.join(unknown)}; export it without")
+    return document, binary
+
+
+def _chunks(data: bytes) -> tuple[bytes, bytes | None]:
+    if len(data) < 20:
+        raise UserError("truncated: the .glb file ends in its header")
+    _, version, length = struct.unpack_from("<4sII", data)
+    if version != 2:
+        raise UserError(f"glTF version {version}; export it as 2.0")
+    if length > len(data):
+        raise UserError(f"truncated: {length} bytes expected, the file has {len(data)}")
+    found: dict[int, bytes] = {}
+    at = 12
+    while at + 8 <= length:
+        size, kind = struct.unpack_from("<II", data, at)
+        at += 8
+        if size > length - at:
+            raise UserError("truncated: a chunk reaches beyond the file")
+        found.setdefault(kind, data[at : at + size])
+        at += size
+    if _JSON_CHUNK not in found:
+        raise UserError("the .glb file has no JSON chunk")
+    return found[_JSON_CHUNK], found.get(_BINARY_CHUNK)
+
+
+def external(path: Path, uri: str) -> Path:
+    """The file that a URI in `path` means; UserError for one that is not beside it."""
+    if urllib.parse.urlparse(uri).scheme:
+        raise UserError(f"it names {uri:.60}; files beside it alone are read")
+    name = urllib.parse.unquote(uri)
+    if "\0" in name:
+        raise UserError("a file name holds a zero byte")
+    return path.parent / name

@@ -85,6 +85,16 @@ class Material:
         if not 1 <= self.ior <= 4:
             raise UserError(f"ior is {self.ior}; it lies between 1 and 4")
 
+    def is_textured(self) -> bool:
+        """Whether it needs texture coordinates."""
+        textures = (
+            self.base_color_texture,
+            self.metallic_roughness_texture,
+            self.normal_texture,
+            self.emission_texture,
+        )
+        return any(texture is not None for texture in textures)
+
     @classmethod
     def diffuse(cls, color: Color, emission: Color = (0.0, 0.0, 0.0)) -> Material:
         """A Lambertian surface, without any gloss."""

@@ -190,28 +190,40 @@ class Mesh:
 class Instance:
     """A mesh at a place: scaled (one factor or three), then turned and moved by ``pose``.
 
-    Several instances of one mesh share its triangles. Raises UserError for a scale that is
-    zero or not finite.
+    Several instances of one mesh share its triangles. ``inner`` (4, 4), where it is given,
+    comes before: the mesh's own place in an object of several parts. Raises UserError for a
+    scale that is zero or not finite.
     """
 
     mesh: Mesh
     pose: Pose = field(default_factory=Pose.identity)
     scale: Values = 1.0
+    inner: NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
         self.matrix()
 
     def matrix(self) -> NDArray[np.float64]:
         """World from mesh, the rows of (3, 4)."""
-        return affine(self.pose, self.scale)
+        return affine(self.pose, self.scale, self.inner)
 
 
-def affine(pose: Pose, scale: Values = 1.0) -> NDArray[np.float64]:
-    """(3, 4) of a scale, then a pose; UserError for a scale that is zero or not finite."""
+def affine(
+    pose: Pose, scale: Values = 1.0, inner: NDArray[np.float64] | None = None
+) -> NDArray[np.float64]:
+    """(3, 4) of `inner` (4, 4), then a scale, then a pose.
+
+    Raises UserError for a scale that is zero or not finite.
+    """
     factors = np.broadcast_to(np.asarray(scale, float), (3,))
     if not (np.isfinite(factors).all() and factors.all()):
         raise UserError(f"scale is {scale}; it must be finite and not zero")
-    return np.column_stack([pose.rotation * factors, pose.translation])
+    outer = np.column_stack([pose.rotation * factors, pose.translation])
+    if inner is None:
+        return outer
+    return np.column_stack(
+        [outer[:, :3] @ inner[:3, :3], outer[:, :3] @ inner[:3, 3] + outer[:, 3]]
+    )
 
 
 def _materials(

@@ -9,9 +9,8 @@ from __future__ import annotations
 import base64
 import binascii
 import math
-import struct
 import urllib.parse
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -25,18 +24,6 @@ from chromeball.renderer.part import Part, say
 from chromeball.renderer.texture import TextureCache, read_texture, texture_of_bytes
 from chromeball.scene.errors import UserError
 
-_SUPPORTED = {
-    "EXT_mesh_gpu_instancing",
-    "EXT_texture_webp",
-    "KHR_materials_clearcoat",
-    "KHR_materials_emissive_strength",
-    "KHR_materials_ior",
-    "KHR_materials_specular",
-    "KHR_materials_transmission",
-    "KHR_materials_volume",
-    "KHR_mesh_quantization",
-    "KHR_texture_transform",
-}
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _ALPHA_MODES: dict[str, Literal["opaque", "mask", "blend"]] = {
@@ -45,8 +32,6 @@ _ALPHA_MODES: dict[str, Literal["opaque", "mask", "blend"]] = {
     "BLEND": "blend",
 }
 _WRAPS: dict[int, Wrap] = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
-_TEXTURES = [f.name for f in fields(Material) if f.name.endswith("_texture")]
-_JSON_CHUNK, _BINARY_CHUNK = 0x4E4F534A, 0x004E4942
 #: Most placed meshes, so that a small file cannot ask for everything.
 _MOST_PLACES = 1_000_000
 
@@ -70,59 +55,6 @@ def read_gltf(path: Path) -> list[Part]:
         raise UserError(f"not a readable glTF file: {reason:.200}", file=path) from error
 
 
-def gltf_files(path: Path) -> list[Path]:
-    """The buffers and images that a glTF file names, without reading them."""
-    document, _ = _open(path)
-    uris = [b.uri for b in document.buffers] + [i.uri for i in document.images]
-    return [_external(path, uri) for uri in uris if uri and not uri.startswith("data:")]
-
-
-def _open(path: Path) -> tuple[gltf.Document, bytes | None]:
-    """The JSON part and, of a .glb, the binary chunk."""
-    data = path.read_bytes()
-    binary: bytes | None = None
-    if data.startswith(b"glTF"):
-        data, binary = _chunks(data)
-    document = msgspec.json.decode(data, type=gltf.Document)
-    if not document.asset.version.startswith("2."):
-        raise UserError(f"glTF version {document.asset.version:.20}; export it as 2.0")
-    unknown = [e for e in document.extensions_required if e not in _SUPPORTED]
-    if unknown:
-        raise UserError(f"it needs {', '.join(unknown)}; export it without")
-    return document, binary
-
-
-def _chunks(data: bytes) -> tuple[bytes, bytes | None]:
-    if len(data) < 20:
-        raise UserError("truncated: the .glb file ends in its header")
-    _, version, length = struct.unpack_from("<4sII", data)
-    if version != 2:
-        raise UserError(f"glTF version {version}; export it as 2.0")
-    if length > len(data):
-        raise UserError(f"truncated: {length} bytes expected, the file has {len(data)}")
-    found: dict[int, bytes] = {}
-    at = 12
-    while at + 8 <= length:
-        size, kind = struct.unpack_from("<II", data, at)
-        at += 8
-        if size > length - at:
-            raise UserError("truncated: a chunk reaches beyond the file")
-        found.setdefault(kind, data[at : at + size])
-        at += size
-    if _JSON_CHUNK not in found:
-        raise UserError("the .glb file has no JSON chunk")
-    return found[_JSON_CHUNK], found.get(_BINARY_CHUNK)
-
-
-def _external(path: Path, uri: str) -> Path:
-    if urllib.parse.urlparse(uri).scheme:
-        raise UserError(f"it names {uri:.60}; files beside it alone are read")
-    name = urllib.parse.unquote(uri)
-    if "\0" in name:
-        raise UserError("a file name holds a zero byte")
-    return path.parent / name
-
-
 def _item[T](items: list[T], index: int, what: str) -> T:
     if not 0 <= index < len(items):
         raise UserError(f"it names {what} {index}, there are {len(items)}")
@@ -132,7 +64,7 @@ def _item[T](items: list[T], index: int, what: str) -> T:
 class _Reader:
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.document, self.binary = _open(path)
+        self.document, self.binary = gltf.open_document(path)
         self.buffers: dict[int, memoryview] = {}
         self.textures = TextureCache()
         self.materials: dict[
@@ -255,7 +187,7 @@ class _Reader:
             uv = _moved(uv, transform)
         if "COLOR_0" in primitive.attributes:
             say(self.path, "colours of vertices are not used")
-        if uv is None and any(getattr(material, name) for name in _TEXTURES):
+        if uv is None and material.is_textured():
             raise UserError(f"a textured mesh has no TEXCOORD_{coord}")
         return Part(
             vertices,
@@ -368,7 +300,7 @@ class _Reader:
     def _read(self, uri: str, what: str) -> bytes:
         if uri.startswith("data:"):
             return _embedded(uri)
-        file = _external(self.path, uri)
+        file = gltf.external(self.path, uri)
         if not file.is_file():
             raise UserError(f"its {what} {uri!r:.80} is not there; put it beside")
         return file.read_bytes()
@@ -474,7 +406,7 @@ class _Reader:
 
     def _image(self, image: gltf.Image, color: bool, wrap: tuple[Wrap, Wrap]) -> Texture:
         if image.uri is not None and not image.uri.startswith("data:"):
-            return read_texture(_external(self.path, image.uri), color=color, wrap=wrap)
+            return read_texture(gltf.external(self.path, image.uri), color=color, wrap=wrap)
         if image.uri is not None:
             data = _embedded(image.uri)
         elif image.buffer_view is not None:

@@ -5,24 +5,16 @@ tinyobjloader crashes on broken files and reads NaN as 0: the text is read by th
 
 from __future__ import annotations
 
-import os
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from chromeball.renderer import files
+from chromeball.renderer import files, mtl
 from chromeball.renderer.material import Color, Material, Texture, Wrap
 from chromeball.renderer.part import Part, say
 from chromeball.renderer.read_ply import triangles
 from chromeball.renderer.texture import TextureCache, read_texture
 from chromeball.scene.errors import UserError
-
-#: Options of a map, and how many numbers follow at most.
-_OPTIONS = {
-    "-blendu": 1, "-blendv": 1, "-boost": 1, "-mm": 2, "-o": 3, "-s": 3, "-t": 3,
-    "-texres": 1, "-clamp": 1, "-bm": 1, "-imfchan": 1, "-type": 1, "-colorspace": 1,
-}  # fmt: skip
 
 
 def read_obj(path: Path) -> list[Part]:
@@ -79,111 +71,23 @@ def read_obj(path: Path) -> list[Part]:
     return [Part(positions, faces, normals, uv, index, materials)]
 
 
-def mtl_files(path: Path) -> list[Path]:
-    """The material libraries and images that an OBJ file needs, as far as they are there."""
-    found: list[Path] = []
-    for library in _named(path, b"mtllib"):
-        for file in _library_files(path, library):
-            found.append(file)
-            for line in file.read_text("utf-8", "surrogateescape").splitlines():
-                key, *rest = line.split(maxsplit=1) or [""]
-                if rest and (key.startswith("map_") or key in ("norm", "bump")):
-                    name = _map(rest[0]).name
-                    found += [f for f in (_beside(file, name),) if f.is_file()]
-    return found
-
-
-def _named(path: Path, word: bytes) -> list[str]:
-    """What follows `word` in the lines that begin with it."""
-    with path.open("rb") as file:
-        return [
-            os.fsdecode(line.split(maxsplit=1)[1].strip())
-            for line in file
-            if line.startswith(word) and len(line.split(maxsplit=1)) == 2
-        ]
-
-
-def _beside(file: Path, name: str) -> Path:
-    return file.parent / name.replace("\\", "/")
-
-
-def _library_files(path: Path, library: str) -> list[Path]:
-    """One name with blanks in it, or several names."""
-    for names in ([library], library.split()):
-        paths = [_beside(path, name) for name in names]
-        if "\0" not in library and all(p.is_file() for p in paths):
-            return paths
-    return []
-
-
-@dataclass
-class _Map:
-    name: str
-    clamp: bool = False
-    strength: float = 1.0
-    left_out: list[str] = field(default_factory=list[str])
-
-
-def _map(text: str) -> _Map:
-    """A map's options and, after them, its file."""
-    words = text.split()
-    result = _Map("")
-    i = 0
-    while i < len(words) and words[i] in _OPTIONS:
-        option, most = words[i], _OPTIONS[words[i]]
-        values: list[str] = []
-        i += 1
-        while i < len(words) and len(values) < most and (most == 1 or _is_number(words[i])):
-            values.append(words[i])
-            i += 1
-        if option == "-clamp":
-            result.clamp = values == ["on"]
-        elif option == "-bm" and values and _is_number(values[0]):
-            result.strength = float(values[0])
-        else:
-            result.left_out.append(option)
-    result.name = " ".join(words[i:])
-    return result
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
-
-
 def _libraries(path: Path, libraries: list[str]) -> dict[str, Material]:
     known: dict[str, Material] = {}
     cache = TextureCache()
     for library in libraries:
-        files_ = _library_files(path, library)
+        files_ = mtl.library_files(path, library)
         if not files_:
             raise UserError(
                 f"its materials {library!r} are not there; put them beside", file=path
             )
         for file in files_:
-            for name, lines in _blocks(file).items():
+            for name, lines in mtl.blocks(file).items():
                 try:
                     known[name] = _Mtl(file, name, lines, cache).material()
                 except UserError as error:
                     where = error.file or file
                     raise UserError(f"material {name!r}: {error.what}", file=where) from error
     return known
-
-
-def _blocks(file: Path) -> dict[str, dict[str, str]]:
-    """The lines of each material, by their key."""
-    blocks: dict[str, dict[str, str]] = {}
-    block: dict[str, str] = {}
-    for line in file.read_text("utf-8", "surrogateescape").splitlines():
-        words = line.partition("#")[0].split(maxsplit=1)
-        if len(words) == 2 and words[0] == "newmtl":
-            block = blocks.setdefault(words[1].strip(), {})
-        elif len(words) == 2:
-            block[words[0]] = words[1].strip()
-    return blocks
 
 
 class _Mtl:
@@ -199,7 +103,7 @@ class _Mtl:
         if text is None:
             return default
         word = text.split()[0]
-        if not _is_number(word):
+        if not mtl.is_number(word):
             raise UserError(f"{key} {text:.40} is no number")
         return float(word)
 
@@ -208,7 +112,7 @@ class _Mtl:
         if text is None:
             return default, default, default
         words = text.split()
-        if words[0] in ("spectral", "xyz") or not all(map(_is_number, words[:3])):
+        if words[0] in ("spectral", "xyz") or not all(map(mtl.is_number, words[:3])):
             raise UserError(f"{key} {text:.40} is no RGB colour")
         values = [float(word) for word in words[:3]]
         r, g, b = values if len(values) == 3 else values[:1] * 3
@@ -218,10 +122,10 @@ class _Mtl:
         text = self.lines.get(key)
         if text is None:
             return None
-        map_ = _map(text)
+        map_ = mtl.parse_map(text)
         if map_.left_out:
             say(self.file, f"{self.name}: {key} without its {', '.join(map_.left_out)}")
-        path = _beside(self.file, map_.name)
+        path = mtl.beside(self.file, map_.name)
         if "\0" in map_.name or not path.is_file():
             raise UserError(f"its {key}, {map_.name!r}, is not there; put it beside")
         mode: Wrap = "clamp" if map_.clamp else "repeat"
@@ -246,7 +150,7 @@ class _Mtl:
         for key in ("map_Bump", "map_bump", "bump", "disp", "map_Ks", "map_Ns", "refl"):
             if key in self.lines:
                 say(self.file, f"{self.name}: {key} is not used")
-        strength = _map(self.lines["norm"]).strength if "norm" in self.lines else 1.0
+        strength = mtl.parse_map(self.lines["norm"]).strength if "norm" in self.lines else 1.0
         cut = "map_d" in self.lines
         return Material(
             base_color=base,

@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 
 from chromeball.renderer.composite import CapturedSet, Composite, Compositor, even_light
 from chromeball.renderer.exposed import expose
+from chromeball.renderer.inputs import scene_inputs
 from chromeball.renderer.look import CameraLook, apply_look, read_look
 from chromeball.renderer.path import corner_rays
-from chromeball.renderer.scene import object_meshes, turn
+from chromeball.renderer.scene import object_instances, turn
 from chromeball.scene.camera import WORLD_FROM_LATLONG, CameraModel
 from chromeball.scene.color import luminance
 from chromeball.scene.errors import UserError
@@ -118,7 +119,7 @@ def prepare(scene: Scene, folder: Path, view: View, spp: int) -> Job:
         )
     else:
         camera = virtual_camera(view, origin)
-    inputs += [folder / o.mesh for o in scene.object if (folder / o.mesh).is_file()]
+    inputs += [path for path in scene_inputs(scene, folder) if path.is_file()]
     place = camera.world_from_camera.translation
     captured = (
         even_light(stand_in, place)
@@ -126,7 +127,7 @@ def prepare(scene: Scene, folder: Path, view: View, spp: int) -> Job:
         else CapturedSet(environment, origin, stand_in)
     )
     compositor = Compositor(
-        object_meshes(scene, folder),
+        [thing for things in object_instances(scene, folder) for thing in things],
         captured,
         corner_rays(camera),
         place,

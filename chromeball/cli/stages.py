@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import glob
 import json
+import os
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ from typing import Any
 
 import msgspec
 
+from chromeball.renderer.inputs import scene_inputs
 from chromeball.scene.errors import UserError
 from chromeball.scene.manifest import Bracket, Lens, Meter, Quad, Scene, View
 
@@ -101,7 +103,7 @@ class _Planner:
         self.build = scene.folder.rstrip("/")
         self.frames: dict[str, list[str]] = {}
         self.linear: dict[str, bool] = {}
-        self.rendered = scene.view if scene.object else []
+        self.rendered = scene.view if scene.object or scene.light else []
         self.plates = [view for view in self.rendered if view.bracket or view.plate]
         self.shots = [] if scene.env.file or not scene.probe else scene.probe.shot
 
@@ -627,7 +629,7 @@ class _Planner:
     def _render(self, view: View) -> StagePlan:
         name = f"render {view.name}"
         scene = self.scene
-        if not scene.object:
+        if not scene.object and not scene.light:
             return StagePlan(name, False, "no [[object]]")
         inputs = [self._env()]
         if scene.stand_in:
@@ -640,7 +642,7 @@ class _Planner:
             inputs.append(f"{self.build}/{view.name}.cameramodel")
         elif view.camera:
             inputs.append(view.camera)
-        inputs += [o.mesh for o in scene.object if o.mesh not in ("sphere", "box", "cylinder")]
+        inputs += [os.path.relpath(path, self.root) for path in scene_inputs(scene, self.root)]
         picture = f"{self.build}/{view.name}.exr"
         pictures = [picture, f"{self.build}/{view.name}.png"]
         look = view.look
@@ -650,15 +652,21 @@ class _Planner:
             pictures.append(f"{self.build}/{view.name}.camera.png")
         if look.jpeg is not None:
             pictures.append(f"{self.build}/{view.name}.camera.jpg")
-        count = len(scene.object)
+        counts = (("object", len(scene.object)), ("light", len(scene.light)))
+        things = [f"{n} {what}{'s' if n > 1 else ''}" for what, n in counts if n]
         return StagePlan(
             name,
             True,
-            f"{count} object{'s' if count > 1 else ''} at {scene.render.spp} samples a pixel",
+            f"{' and '.join(things)} at {scene.render.spp} samples a pixel",
             tuple(dict.fromkeys(inputs)),
             tuple(pictures),
             ("chromeball", "render", self.file, *_option("view", view.name), "-o", picture),
-            {"object": scene.object, "render": scene.render, "view": view},
+            {
+                "object": scene.object,
+                "light": scene.light,
+                "render": scene.render,
+                "view": view,
+            },
         )
 
     def _report(self, plan: Sequence[StagePlan]) -> StagePlan:

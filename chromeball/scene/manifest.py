@@ -25,6 +25,8 @@ type Positive = Annotated[float, Meta(gt=0)]
 type Point = tuple[float, float]
 type Vector = tuple[float, float, float]
 type Quad = tuple[Point, Point, Point, Point]
+#: Meshes that need no file.
+PRIMITIVES = ("sphere", "box", "cylinder")
 type Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$")]
 
 
@@ -185,15 +187,98 @@ class StandIn(Table, frozen=True):
 
 
 class Material(Table, frozen=True):
-    """``color``: albedo of diffuse, reflectance of mirror, transmittance of glass."""
+    """What an object is made of, after glTF's metallic-roughness model.
 
-    kind: Literal["diffuse", "mirror", "glass"] = "diffuse"
-    color: tuple[
-        Annotated[float, Meta(ge=0, le=1)],
-        Annotated[float, Meta(ge=0, le=1)],
-        Annotated[float, Meta(ge=0, le=1)],
-    ] = (0.5, 0.5, 0.5)
-    ior: Annotated[float, Meta(ge=1, le=4)] = 1.5
+    ``color``: albedo of diffuse, reflectance of mirror, transmittance of glass and of
+    thin_glass (a sheet without refraction), base colour of metallic_roughness; 0.5 unless
+    given, 1 under a texture. The other keys are as in
+    :class:`chromeball.renderer.material.Material`, and each kind takes those that mean
+    something to it. Textures are image files, multiplied in; 8-bit colours are sRGB.
+    """
+
+    kind: Literal["diffuse", "mirror", "glass", "thin_glass", "metallic_roughness"] = "diffuse"
+    color: Vector | None = None
+    metallic: float | None = None
+    roughness: float | None = None
+    specular: float | None = None
+    ior: float | None = None
+    transmission: float | None = None
+    thin: bool | None = None
+    clearcoat: float | None = None
+    clearcoat_roughness: float | None = None
+    emission: Vector | None = None
+    alpha: float | None = None
+    alpha_mode: Literal["opaque", "mask", "blend"] | None = None
+    alpha_cutoff: float | None = None
+    normal_scale: float | None = None
+    color_texture: str | None = None
+    metallic_roughness_texture: str | None = None
+    normal_texture: str | None = None
+    emission_texture: str | None = None
+    wrap: Literal["repeat", "clamp", "mirror"] | None = None
+
+    def __post_init__(self) -> None:
+        given = {name: v for name in _MATERIAL if (v := getattr(self, name)) is not None}
+        for name, value in given.items():
+            if self.kind not in (kinds := _MATERIAL[name]):
+                raise ValueError(f"{name} is not for {self.kind}, but {', '.join(kinds)}")
+            share = name not in ("ior", "normal_scale")
+            if isinstance(value, float) and share and not 0 <= value <= 1:
+                raise ValueError(f"{name} lies between 0 and 1")
+        if self.color is not None and not all(0 <= c <= 1 for c in self.color):
+            raise ValueError("color lies between 0 and 1")
+        if self.ior is not None and not 1 <= self.ior <= 4:
+            raise ValueError("ior lies between 1 and 4")
+        if self.emission is not None and min(self.emission) < 0:
+            raise ValueError("emission is 0 or more")
+        if self.wrap is not None and not self.textures():
+            raise ValueError("wrap is for textures, and there is none")
+        if self.normal_scale is not None and self.normal_texture is None:
+            raise ValueError("normal_scale is for normal_texture, and there is none")
+        if self.alpha_cutoff is not None and self.alpha_mode != "mask":
+            raise ValueError('alpha_cutoff is for alpha_mode = "mask"')
+        if self.alpha is not None and self.alpha_mode == "opaque":
+            raise ValueError('alpha is for alpha_mode = "blend" or "mask"')
+
+    def textures(self) -> list[str]:
+        """The image files that it names."""
+        names = [name for name in _MATERIAL if name.endswith("_texture")]
+        return [file for name in names if (file := getattr(self, name)) is not None]
+
+
+_MATT = ("diffuse", "metallic_roughness")
+_CLEAR = ("glass", "thin_glass", "metallic_roughness")
+_GENERAL = ("metallic_roughness",)
+#: Which kinds of material have a key.
+_MATERIAL: dict[str, tuple[str, ...]] = {
+    "roughness": _CLEAR,
+    "ior": _CLEAR,
+    **dict.fromkeys(
+        (
+            *("emission", "alpha", "alpha_mode", "alpha_cutoff", "normal_scale", "wrap"),
+            *("color_texture", "normal_texture", "emission_texture"),
+        ),
+        _MATT,
+    ),
+    **dict.fromkeys(
+        (
+            *("metallic", "specular", "transmission", "thin", "clearcoat"),
+            *("clearcoat_roughness", "metallic_roughness_texture"),
+        ),
+        _GENERAL,
+    ),
+}
+
+
+class Placement(Table, frozen=True):
+    """One more place of an object: scaled, then rotated (degrees), then moved."""
+
+    position: Vector = (0.0, 0.0, 0.0)
+    rotation: Vector = (0.0, 0.0, 0.0)
+    scale: float | tuple[float, float, float] = 1.0
+
+    def __post_init__(self) -> None:
+        _check_scale(self.scale)
 
 
 class ObjectKey(Table, frozen=True):
@@ -212,9 +297,12 @@ class Object(Table, frozen=True):
     """A synthetic object.
 
     ``mesh`` is sphere, box or cylinder (unit size, standing on y = 0), or a mesh file; scaled,
-    then rotated (degrees about x, y, z in turn), then moved to ``position``. ``key`` moves it
-    over the frames of a sequence (:mod:`chromeball.scene.sequence`); ``interpolation``:
-    positions run straight from key to key, or along a ``cubic`` curve (Catmull-Rom).
+    then rotated (degrees about x, y, z in turn), then moved to ``position``. ``material``: in
+    place of the file's own. ``smooth``: a mesh file without normals is smooth across edges
+    flatter than so many degrees. ``instances``: the object, as it stands by its own keys, is
+    copied to each of these places. ``key`` moves it over the frames of a sequence
+    (:mod:`chromeball.scene.sequence`); ``interpolation``: positions run straight from key to
+    key, or along a ``cubic`` curve (Catmull-Rom).
     """
 
     name: Name
@@ -223,12 +311,103 @@ class Object(Table, frozen=True):
     rotation: Vector = (0.0, 0.0, 0.0)
     # msgspec 0.22 corrupts memory on a bounded float beside a tuple: bounds are checked below
     scale: float | tuple[float, float, float] = 1.0
-    material: Material = Material()
+    material: Material | None = None
+    smooth: float | None = None
+    instances: list[Placement] = []
     key: list[ObjectKey] = []
     interpolation: Literal["linear", "cubic"] = "linear"
 
     def __post_init__(self) -> None:
         _check_scale(self.scale)
+        if self.smooth is not None and not 0 < self.smooth <= 180:
+            raise ValueError("smooth is an angle between 0 and 180 degrees")
+        if self.smooth is not None and self.mesh in PRIMITIVES:
+            raise ValueError("smooth is for mesh files; primitives have their normals")
+
+
+class Light(Table, frozen=True):
+    """A synthetic light.
+
+    ``point``: ``intensity`` (W/sr, in the map's units of radiance times m^2) at ``position``.
+    ``spot``: the same within ``angle`` degrees of its axis, full within ``inner_angle`` (0
+    unless given). ``sun``: ``irradiance`` on a surface that faces it, from infinitely far.
+    ``area``: a rectangle of ``size`` (width, height) or a disc of ``radius`` metres about
+    ``position``, with ``radiance``, or ``power`` in all; ``texture`` is an image that is
+    multiplied in, its top up. It is black behind unless ``two_sided``.
+    The axis is ``direction``, into which it shines, or leads to the point ``look_at``.
+    """
+
+    name: Name
+    kind: Literal["point", "spot", "sun", "area"]
+    position: Vector | None = None
+    direction: Vector | None = None
+    look_at: Vector | None = None
+    intensity: Vector | None = None
+    irradiance: Vector | None = None
+    radiance: Vector | None = None
+    power: Vector | None = None
+    angle: float | None = None
+    inner_angle: float | None = None
+    size: tuple[float, float] | None = None
+    radius: float | None = None
+    texture: str | None = None
+    two_sided: bool = False
+
+    def __post_init__(self) -> None:
+        needed, either, allowed = _LIGHT[self.kind]
+        given = {
+            name
+            for name in self.__struct_fields__
+            if name not in ("name", "kind") and getattr(self, name) not in (None, False)
+        }
+        for name in needed:
+            if name not in given:
+                raise ValueError(f"{_LIGHT_NAMES[self.kind]} needs {name}")
+        for names in either:
+            if len(given & {*names}) != 1:
+                raise ValueError(
+                    f"{_LIGHT_NAMES[self.kind]} needs one of {' and '.join(names)}"
+                )
+        known = {*needed, *allowed, *sum(either, ())}
+        for name in sorted(given - known):
+            raise ValueError(
+                f"{_LIGHT_NAMES[self.kind]} has no {name}; it has {', '.join(sorted(known))}"
+            )
+        for name in ("intensity", "irradiance", "radiance", "power", "size"):
+            value = getattr(self, name)
+            if value is not None and not min(value) >= 0:
+                raise ValueError(f"{name} is 0 or more")
+        if self.size is not None and not min(self.size) > 0:
+            raise ValueError("size must be positive")
+        if self.radius is not None and not self.radius > 0:
+            raise ValueError("radius must be positive")
+        inner = self.inner_angle or 0.0
+        if self.angle is not None and not 0 <= inner <= self.angle <= 180:
+            raise ValueError("angles: 0 <= inner_angle <= angle <= 180 degrees")
+        if self.direction is not None and not any(self.direction):
+            raise ValueError("direction is zero")
+        if self.look_at is not None and self.look_at == self.position:
+            raise ValueError("look_at is the light's own position")
+
+
+_AXIS = ("direction", "look_at")
+_LIGHT_NAMES = {
+    "point": "a point light",
+    "spot": "a spot light",
+    "sun": "a sun",
+    "area": "an area light",
+}
+#: What a kind of light needs, of which it needs one, and what it may have.
+_LIGHT: dict[str, tuple[tuple[str, ...], tuple[tuple[str, ...], ...], tuple[str, ...]]] = {
+    "point": (("position", "intensity"), (), ()),
+    "spot": (("position", "intensity", "angle"), (_AXIS,), ("inner_angle",)),
+    "sun": (("direction", "irradiance"), (), ()),
+    "area": (
+        ("position",),
+        (_AXIS, ("radiance", "power"), ("size", "radius")),
+        ("texture", "two_sided"),
+    ),
+}
 
 
 class ViewKey(Table, frozen=True):
@@ -343,6 +522,7 @@ class Scene(Table, frozen=True):
     env: Env = Env()
     stand_in: list[StandIn] = []
     object: list[Object] = []
+    light: list[Light] = []
     view: list[View] = []
     render: Render = Render()
     truth: Truth | None = None
@@ -415,6 +595,7 @@ def _check_names(scene: Scene) -> None:
         ("bracket", scene.bracket),
         ("stand_in", scene.stand_in),
         ("object", scene.object),
+        ("light", scene.light),
         ("view", scene.view),
     ):
         names = [entry.name for entry in entries]

@@ -14,7 +14,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from chromeball.renderer.assets import mesh_inputs, read_parts
+from chromeball.renderer.assets import read_parts
+from chromeball.renderer.inputs import mesh_inputs
 from chromeball.renderer.part import face_areas
 from chromeball.scene.errors import UserError
 from tests.renderer.asset_files import Gltf, cube, picture, ply

@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from chromeball.renderer import files
-from chromeball.renderer.assets import mesh_inputs, read_parts
+from chromeball.renderer.assets import read_parts
+from chromeball.renderer.inputs import mesh_inputs
 from chromeball.renderer.material import Material
 from chromeball.renderer.part import Part, face_areas, smooth
 from chromeball.renderer.primitives import box, cylinder, sphere

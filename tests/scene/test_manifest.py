@@ -142,7 +142,7 @@ def test_memory_stays_whole() -> None:
         ("scale = [1, 2, 3]", "scale = 0", "scale must be positive"),
         ("scale = [1, 2, 3]", "scale = [1, -2, 3]", "scale must be positive"),
         ("scale = [1, 2, 3]", "scale = inf", "scale must be positive"),
-        ("color = [1, 0.5, 0]", "color = [1, 0.5, 2]", "<= 1"),
+        ("color = [1, 0.5, 0]", "color = [1, 0.5, 2]", "color lies between 0 and 1"),
         ('"difference"', '"magic"', "Invalid enum value 'magic'"),
         ('name = "plate"', 'name = "front"', r"two \[\[bracket\]\] are named 'front'"),
         ('bracket = "plate"', 'bracket = "plat"', r"named 'plat'; did you mean 'plate'"),
@@ -266,3 +266,74 @@ def test_any_time_is_positive_or_one_line(value: str | float) -> None:
     except UserError:
         return
     assert 0 < seconds < 1e6
+
+
+def _object(text: str) -> str:
+    return f'name = "s"\n[[object]]\nname = "o"\nmesh = "a.glb"\n{text}\n'
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('material = { kind = "mirror", roughness = 0.2 }', "roughness is not for mirror"),
+        ('material = { kind = "diffuse", clearcoat = 1 }', "clearcoat is not for diffuse"),
+        ('material = { kind = "glass", roughness = 2 }', "roughness lies between 0 and 1"),
+        ("material = { emission = [1, -1, 0] }", "emission is 0 or more"),
+        ('material = { wrap = "clamp" }', "wrap is for textures"),
+        ("material = { normal_scale = 2 }", "normal_scale is for normal_texture"),
+        ("material = { alpha_cutoff = 0.5 }", 'alpha_cutoff is for alpha_mode = "mask"'),
+        ('material = { alpha = 0.5, alpha_mode = "opaque" }', "alpha is for alpha_mode"),
+        ('material = { kind = "glas" }', "Invalid enum value 'glas'"),
+        ("smooth = 200", "smooth is an angle between 0 and 180"),
+        ("instances = [{ position = [0, 0, 1], scale = 0 }]", "scale must be positive"),
+        ("instances = [{ place = [0, 0, 1] }]", r"'place' in \[object\[0\].instances\[0\]\]"),
+    ],
+)
+def test_mistakes_in_objects(text: str, message: str) -> None:
+    with pytest.raises(UserError, match=message) as caught:
+        parse_scene(_object(text), "my.toml")
+    assert "\n" not in str(caught.value)
+
+
+POINT = 'kind = "point"\nposition = [0, 1, 0]\nintensity = [1, 1, 1]'
+SPOT = POINT.replace("point", "spot") + "\nangle = 30\ndirection = [0, -1, 0]"
+AREA = (
+    'kind = "area"\nposition = [0, 1, 0]\nlook_at = [0, 0, 0]\nsize = [1, 2]\n'
+    "radiance = [1, 1, 1]"
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('kind = "point"\nposition = [0, 1, 0]', "point light needs intensity"),
+        (POINT + "\nradius = 1", "point light has no radius; it has position, intensity"),
+        (SPOT + "\nlook_at = [0, 0, 0]", "spot light needs one of direction and look_at"),
+        (SPOT + "\ninner_angle = 40", "0 <= inner_angle <= angle"),
+        ('kind = "sun"\nirradiance = [1, 1, 1]', "a sun needs direction"),
+        ('kind = "sun"\nirradiance = [1, 1, 1]\ndirection = [0, 0, 0]', "direction is zero"),
+        (AREA + "\nradius = 1", "area light needs one of size and radius"),
+        (AREA + "\npower = [1, 1, 1]", "area light needs one of radiance and power"),
+        (AREA.replace("[1, 2]", "[1, 0]"), "size must be positive"),
+        (
+            AREA.replace("look_at = [0, 0, 0]", "look_at = [0, 1, 0]"),
+            "the light's own position",
+        ),
+        (AREA.replace("radiance = [1", "radiance = [-1"), "radiance is 0 or more"),
+        (POINT + "\ncolour = 2", "unknown key 'colour'"),
+    ],
+)
+def test_mistakes_in_lights(text: str, message: str) -> None:
+    with pytest.raises(UserError, match=message):
+        parse_scene(f'name = "s"\n[[light]]\nname = "l"\n{text}\n')
+
+
+def test_lights_are_read() -> None:
+    text = "".join(
+        f'[[light]]\nname = "l{i}"\n{light}\n' for i, light in enumerate((POINT, SPOT, AREA))
+    )
+    lights = parse_scene('name = "s"\n' + text).light
+    assert [light.kind for light in lights] == ["point", "spot", "area"]
+    assert lights[1].angle == 30
+    with pytest.raises(UserError, match=r"two \[\[light\]\] are named 'l0'"):
+        parse_scene('name = "s"\n' + text.replace("l1", "l0"))
