@@ -92,7 +92,7 @@ Vec3 Compositor::object_radiance(Hit hit, Vec3 d, int bounces, Path& path) const
     const bool specular = is_specular(s);
     if (!specular) {
       if (bounces < 0) return sum;
-      sum += beta * direct_light(s, -d, bounces, path);
+      sum += beta * (direct_light(s, -d, bounces, path) + delta_light(s, -d, path));
     }
     const Scatter next = sample(s, -d, path.sampler);
     beta *= next.weight;
@@ -158,6 +158,50 @@ Vec3 Compositor::captured_light(const Surface& s, Vec3 wo, int bounces, Path& pa
   if (!Captured::reaches(light, place)) return {};
   return (1 / (light.density + density(s, wo, light.d))) * f *
          stand_in_radiance(place, light.d, bounces, path);
+}
+
+// The captured set stands in the way of a light. Geometry that only emits stands for what is
+// far away, and a sun is farther.
+bool Compositor::in_shadow_of_set(Vec3 x, const DeltaLight& light,
+                                  const DeltaLight::Incident& in, Path& path) const {
+  const Place place = meet_stand_in(x, in.d, in.t, path);
+  return place && (place.support || !light.sun);
+}
+
+// What the lights without size send to a surface of an object, and this on to wo.
+Vec3 Compositor::delta_light(const Surface& s, Vec3 wo, Path& path) const {
+  Vec3 sum;
+  for (const DeltaLight& light : objects_->delta_lights()) {
+    const auto in = light.incident(s.p);
+    Vec3 f = is_zero(in.irradiance) ? Vec3() : shade(s, wo, in.d) * in.irradiance;
+    if (is_zero(f)) continue;
+    const Vec3 x = s.start(in.d);
+    if (may_hit(x, in.d)) {
+      ++path.rays;
+      f *= objects_->transmittance(x, in.d, in.t);
+      if (is_zero(f)) continue;
+    }
+    if (!in_shadow_of_set(x, light, in, path)) sum += f;
+  }
+  return sum;
+}
+
+// What they add to the irradiance of a support surface.
+Vec3 Compositor::delta_change(Vec3 x, Vec3 n, Path& path) const {
+  Vec3 dE;
+  for (const DeltaLight& light : objects_->delta_lights()) {
+    const auto in = light.incident(x);
+    const float cos = dot(in.d, n);
+    if (!(cos > 0) || is_zero(in.irradiance)) continue;
+    Vec3 E = cos * in.irradiance;
+    if (may_hit(x, in.d)) {
+      ++path.rays;
+      E *= objects_->transmittance(x, in.d, in.t);
+      if (is_zero(E)) continue;
+    }
+    if (!in_shadow_of_set(x, light, in, path)) dE += E;
+  }
+  return dE;
 }
 
 // What a ray sees of the set with the objects in it: L_cap Q.
@@ -227,18 +271,20 @@ Vec3 Compositor::lamp_change(Vec3 x, Vec3 n, const Cones& cones, int bounces,
 Vec3 Compositor::relative_change(const Place& place, int bounces, bool all, Path& path) const {
   const Vec3 x = place.start(), n = place.n;
   const Cones cones(x, n, bounds_);
-  if (cones.empty()) return {};
-  const bool lamps = objects_->shines();
-  const int strategies = lamps ? 3 : 2;
-  const int one = all ? -1 : std::min(int(path.sampler.pair().x * strategies), strategies - 1);
   Vec3 dE;
-  if (all || one == 0) dE += light_change(x, n, cones, bounces, path);
-  if (all || one == 1) {
-    dE += cone_change(x, n, cones.sample(path.sampler.pair()), cones, bounces, path);
+  if (!cones.empty()) {
+    const bool lamps = objects_->shines();
+    const int strategies = lamps ? 3 : 2;
+    const int one = all ? -1 : std::min(int(path.sampler.pair().x * strategies), strategies - 1);
+    if (all || one == 0) dE += light_change(x, n, cones, bounces, path);
+    if (all || one == 1) {
+      dE += cone_change(x, n, cones.sample(path.sampler.pair()), cones, bounces, path);
+    }
+    if (lamps && (all || one == 2)) dE += lamp_change(x, n, cones, bounces, path);
+    if (!all) dE *= float(strategies);
   }
-  if (lamps && (all || one == 2)) dE += lamp_change(x, n, cones, bounces, path);
+  dE += delta_change(x, n, path);
   if (is_zero(dE)) return {};
-  if (!all) dE *= float(strategies);
   const Vec3 E = irradiance_.at(place);
   return {E.x > 0 ? dE.x / E.x : 0, E.y > 0 ? dE.y / E.y : 0, E.z > 0 ? dE.z / E.z : 0};
 }

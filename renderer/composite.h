@@ -76,6 +76,10 @@ class Compositor {
   Vec3 direct_light(const Surface& s, Vec3 wo, int bounces, Path& path) const;
   Vec3 captured_light(const Surface& s, Vec3 wo, int bounces, Path& path) const;
   float lamp_density(const Surface& s, const Hit& hit, Vec3 from, Vec3 d) const;
+  Vec3 delta_light(const Surface& s, Vec3 wo, Path& path) const;
+  Vec3 delta_change(Vec3 x, Vec3 n, Path& path) const;
+  bool in_shadow_of_set(Vec3 x, const DeltaLight& light, const DeltaLight::Incident& in,
+                        Path& path) const;
   Vec3 stand_in_radiance(const Place& place, Vec3 d, int bounces, Path& path) const;
 
   // The strategies for dE at x on a support with normal n.

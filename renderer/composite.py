@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chromeball.renderer import core
+from chromeball.renderer.delta_light import DeltaLight
 from chromeball.renderer.mesh import Instance, Mesh, Values, affine
 from chromeball.renderer.world import world
 from chromeball.scene.errors import UserError
@@ -132,6 +133,9 @@ class Compositor:
         mirrors and glass are always followed.
     mode
         ``quotient``: B Q, ``difference``: B + L_cap dE / E_without.
+    lights
+        Synthetic lights without size; they light objects and support surfaces. Lights with a
+        size are objects that shine.
     samples
         About how many samples a pixel are to come: the order of the points is made for it.
     integrator
@@ -158,6 +162,7 @@ class Compositor:
         mode: Literal["quotient", "difference"] = "quotient",
         seed: int = 0,
         samples: int = 64,
+        lights: Sequence[DeltaLight] = (),
         plate_samples: int = 16,
         integrator: Integrator = "path",
         filtered: bool = True,
@@ -170,8 +175,9 @@ class Compositor:
         self._environment = np.ascontiguousarray(captured.environment, np.float32)
         self._plate_samples = plate_samples
         self._inner = _inner(objects)
+        self._lights = lights
         self._core = core.Compositor(
-            world(objects),
+            world(objects, lights),
             _core_stand_in(captured.stand_in),
             self._environment,
             _triple(captured.origin),
@@ -203,9 +209,17 @@ class Compositor:
         self._seen = corners[1:, 1:] & corners[1:, :-1] & corners[:-1, 1:] & corners[:-1, :-1]
         self._start()
 
-    def place(self, objects: Sequence[Mesh | Instance]) -> None:
-        """Start over with other objects; camera, plate and captured set stay as they are."""
-        self._core.place(world(objects))
+    def place(
+        self,
+        objects: Sequence[Mesh | Instance],
+        lights: Sequence[DeltaLight] | None = None,
+    ) -> None:
+        """Start over with other objects, and other lights where they are given.
+
+        Camera, plate and captured set stay as they are.
+        """
+        self._core.place(world(objects, self._lights if lights is None else lights))
+        self._lights = self._lights if lights is None else lights
         self._inner = _inner(objects)
         self._moved()
 

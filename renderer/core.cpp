@@ -215,6 +215,21 @@ Out transmittance(const WorldArrays& self, In3f origins, In3f directions) {
 NB_MODULE(core, m) {
   nb::class_<WorldArrays>(m, "World")
       .def(nb::init<>())
+      .def(
+          "add_light",
+          [](WorldArrays& self, std::optional<std::array<float, 3>> position,
+             std::array<float, 3> intensity, std::array<float, 3> direction, float cos_inner,
+             float cos_outer) {
+            DeltaLight light;
+            light.sun = !position;
+            if (position) light.position = Vec3(position->data());
+            light.intensity = Vec3(intensity.data());
+            light.direction = normalize(Vec3(direction.data()));
+            light.cos_inner = cos_inner, light.cos_outer = cos_outer;
+            self.world.add(light);
+          },
+          nb::arg("position").none(), nb::arg("intensity"), nb::arg("direction"),
+          nb::arg("cos_inner"), nb::arg("cos_outer"))
       .def("add_texture", &WorldArrays::add_texture, nb::arg("pixels"), nb::arg("wrap"))
       .def(
           "add_material",

@@ -3,6 +3,14 @@ from numpy.typing import NDArray
 
 class World:
     def __init__(self) -> None: ...
+    def add_light(
+        self,
+        position: tuple[float, float, float] | None,
+        intensity: tuple[float, float, float],
+        direction: tuple[float, float, float],
+        cos_inner: float,
+        cos_outer: float,
+    ) -> None: ...
     def add_texture(self, pixels: NDArray[float32], wrap: tuple[int, int]) -> int: ...
     def add_material(
         self,

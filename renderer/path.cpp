@@ -72,7 +72,7 @@ class PathIntegrator {
           const Vec3 known = world_.interpolate(irradiance_, hit);
           if (is_finite(known)) return sum + (1 / kPi) * beta * s.base * known;
         }
-        sum += beta * direct(s, -d, sampler);
+        sum += beta * (direct(s, -d, sampler) + lamps(s, -d));
       }
       const Scatter next = sample(s, -d, sampler);
       beta *= next.weight;
@@ -96,7 +96,7 @@ class PathIntegrator {
     Surface s{};
     s.p = p, s.ng = s.ns = n, s.rise = near(p);
     s.base = Vec3(1.0f), s.alpha = 1, s.outside = true;
-    const Vec3 sum = direct(s, n, sampler);
+    const Vec3 sum = direct(s, n, sampler) + lamps(s, n);
     const Scatter next = sample(s, n, sampler);
     return kPi * (sum + radiance(s.start(next.wi), next.wi, sampler, next.density, 1));
   }
@@ -104,6 +104,17 @@ class PathIntegrator {
  private:
   // Points that are given lie near a face, not on it.
   static float near(Vec3 p) { return 8 * kLift * largest_magnitude(p); }
+
+  // Lights without size, all of them.
+  Vec3 lamps(const Surface& s, Vec3 wo) const {
+    Vec3 sum;
+    for (const DeltaLight& light : world_.delta_lights()) {
+      const auto in = light.incident(s.p);
+      const Vec3 f = is_zero(in.irradiance) ? Vec3() : shade(s, wo, in.d) * in.irradiance;
+      if (!is_zero(f)) sum += f * world_.transmittance(s.start(in.d), in.d, in.t);
+    }
+    return sum;
+  }
 
   // One light sample, weighted against the surface's own: radiance that it sends to wo.
   Vec3 direct(const Surface& s, Vec3 wo, Sampler& sampler) const {

@@ -7,10 +7,13 @@ is tested against it, and photographs the virtual sets of the examples.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
 from chromeball.renderer import core
+from chromeball.renderer.delta_light import DeltaLight
 from chromeball.renderer.mesh import Mesh, Values
 from chromeball.renderer.world import world
 from chromeball.scene.camera import CameraModel
@@ -35,6 +38,7 @@ def path_trace(
     seed: int = 0,
     max_bounces: int = 8,
     environment: NDArray[np.float32] | None = None,
+    lights: Sequence[DeltaLight] = (),
     irradiance: NDArray[np.float32] | None = None,
     gather_from: float = 0.0,
 ) -> NDArray[np.float32]:
@@ -57,6 +61,8 @@ def path_trace(
         Most scatterings on a path: 0 shows the lamps alone, 1 is direct light.
     environment
         (h, w, 3) lat-long radiance around the set, OpenEXR's axes; none: black.
+    lights
+        Lights without size.
     irradiance, gather_from
         (V, 3) known at the vertices: a path ends where it meets a second diffuse surface more
         than `gather_from` metres away; NaN where unknown (:mod:`chromeball.renderer.gather`).
@@ -68,7 +74,7 @@ def path_trace(
         raise ValueError("irradiance and vertices differ in length")
     x, y, z = (float(v) for v in np.asarray(origin, float))
     return core.path_trace(
-        world([mesh]),
+        world([mesh], lights),
         np.ascontiguousarray(rays, np.float32),
         (x, y, z),
         spp,

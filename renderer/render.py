@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from chromeball.renderer.composite import CapturedSet, Composite, Compositor, even_light
 from chromeball.renderer.exposed import expose
 from chromeball.renderer.inputs import scene_inputs
+from chromeball.renderer.lights import area_lights, delta_lights
 from chromeball.renderer.look import CameraLook, apply_look, read_look
 from chromeball.renderer.path import corner_rays
 from chromeball.renderer.scene import object_instances, turn
@@ -127,7 +128,10 @@ def prepare(scene: Scene, folder: Path, view: View, spp: int) -> Job:
         else CapturedSet(environment, origin, stand_in)
     )
     compositor = Compositor(
-        [thing for things in object_instances(scene, folder) for thing in things],
+        [
+            *(thing for things in object_instances(scene, folder) for thing in things),
+            *area_lights(scene, folder),
+        ],
         captured,
         corner_rays(camera),
         place,
@@ -137,6 +141,7 @@ def prepare(scene: Scene, folder: Path, view: View, spp: int) -> Job:
         mode=scene.render.composite,
         seed=scene.render.seed,
         samples=spp,
+        lights=delta_lights(scene),
     )
     look, read = read_look(view.look, scene, folder, plate_file, compositor.plate, camera)
     inputs += read

@@ -9,6 +9,7 @@
 #include <vector>
 
 #include "bounds.h"
+#include "delta_light.h"
 #include "embree.h"
 #include "light.h"
 #include "surface/surface.h"
@@ -35,6 +36,7 @@ class World {
  public:
   uint32_t add(const Texture& texture);
   uint32_t add(const Material& material);
+  void add(const DeltaLight& light) { delta_lights_.push_back(light); }
   // Builds the mesh's BVH.
   uint32_t add(const MeshView& mesh);
   // `matrix`: 12 numbers, the rows of [linear | t], not singular.
@@ -82,6 +84,8 @@ class World {
     return material(hit).power * inverse_power_;
   }
 
+  std::span<const DeltaLight> delta_lights() const { return delta_lights_; }
+
   // Values (V, 3) at the vertices of the only mesh, interpolated; for gathered light.
   Vec3 interpolate(const float* values, const Hit& hit) const;
 
@@ -116,6 +120,7 @@ class World {
   std::vector<Material> materials_;
   std::vector<MeshData> meshes_;
   std::vector<Instance> instances_;
+  std::vector<DeltaLight> delta_lights_;
   SceneHandle top_;
   std::vector<Sphere> bounds_;
   bool transmits_ = false;

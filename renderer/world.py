@@ -8,6 +8,7 @@ from typing import get_args
 import numpy as np
 
 from chromeball.renderer import core
+from chromeball.renderer.delta_light import DeltaLight
 from chromeball.renderer.material import Material, Texture, Wrap
 from chromeball.renderer.mesh import Instance, Mesh
 
@@ -15,7 +16,7 @@ _ALPHA_MODES = ("opaque", "mask", "blend")
 _WRAPS: tuple[Wrap, ...] = get_args(Wrap.__value__)
 
 
-def world(objects: Sequence[Mesh | Instance]) -> core.World:
+def world(objects: Sequence[Mesh | Instance], lights: Sequence[DeltaLight] = ()) -> core.World:
     """The core's scene of these objects, in their order; a mesh stands where its vertices are.
 
     Objects that share a :class:`Mesh` share one copy of it and one BVH; materials and textures
@@ -76,5 +77,9 @@ def world(objects: Sequence[Mesh | Instance]) -> core.World:
     for thing in objects:
         instance = thing if isinstance(thing, Instance) else Instance(thing)
         built.place(mesh(instance.mesh), instance.matrix())
+    for light in lights:
+        built.add_light(
+            light.position, light.intensity, light.direction, light.cos_inner, light.cos_outer
+        )
     built.commit()
     return built

@@ -358,7 +358,8 @@ class Light(Table, frozen=True):
         given = {
             name
             for name in self.__struct_fields__
-            if name not in ("name", "kind") and getattr(self, name) not in (None, False)
+            if name not in ("name", "kind") and (value := getattr(self, name)) is not None
+            if value is not False
         }
         for name in needed:
             if name not in given:
@@ -382,8 +383,10 @@ class Light(Table, frozen=True):
         if self.radius is not None and not self.radius > 0:
             raise ValueError("radius must be positive")
         inner = self.inner_angle or 0.0
-        if self.angle is not None and not 0 <= inner <= self.angle <= 180:
-            raise ValueError("angles: 0 <= inner_angle <= angle <= 180 degrees")
+        if self.angle is not None and not (
+            0 < self.angle <= 180 and 0 <= inner <= self.angle
+        ):
+            raise ValueError("angles: 0 <= inner_angle <= angle <= 180 degrees, angle not 0")
         if self.direction is not None and not any(self.direction):
             raise ValueError("direction is zero")
         if self.look_at is not None and self.look_at == self.position:

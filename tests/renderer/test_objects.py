@@ -95,7 +95,9 @@ def test_textures_lie_beside_the_scene_and_need_uv(tmp_path: Path) -> None:
     texture = material.base_color_texture
     assert texture is not None
     assert texture.wrap == ("mirror", "mirror")
-    np.testing.assert_allclose(texture.pixels, srgb_decode(np.array(128 / 255)), rtol=1e-6)
+    np.testing.assert_allclose(
+        texture.pixels[0, 0], srgb_decode(np.array([128 / 255] * 3)), rtol=1e-6
+    )
     with pytest.raises(UserError, match=r"\[\[object\]\] 'o0': a texture needs texture coord"):
         materials_of(f'mesh = "sphere"\n{wood}', tmp_path)
     with pytest.raises(UserError, match=r"\[\[object\]\] 'o0': .*none.png: no such picture"):
