@@ -120,6 +120,10 @@ def prepare(scene: Scene, folder: Path, view: View, spp: int) -> Job:
         )
     else:
         camera = virtual_camera(view, origin)
+    if scene.light and scene.render.integrator != "path":
+        raise UserError(
+            f"the {scene.render.integrator} integrator knows no lights: --integrator path does"
+        )
     inputs += [path for path in scene_inputs(scene, folder) if path.is_file()]
     place = camera.world_from_camera.translation
     captured = (

@@ -383,9 +383,7 @@ class Light(Table, frozen=True):
         if self.radius is not None and not self.radius > 0:
             raise ValueError("radius must be positive")
         inner = self.inner_angle or 0.0
-        if self.angle is not None and not (
-            0 < self.angle <= 180 and 0 <= inner <= self.angle
-        ):
+        if self.angle is not None and not (0 < self.angle <= 180 and 0 <= inner <= self.angle):
             raise ValueError("angles: 0 <= inner_angle <= angle <= 180 degrees, angle not 0")
         if self.direction is not None and not any(self.direction):
             raise ValueError("direction is zero")
