@@ -176,7 +176,7 @@ Vec3 Compositor::delta_light(const Surface& s, Vec3 wo, Path& path) const {
     Vec3 f = is_zero(in.irradiance) ? Vec3() : shade(s, wo, in.d) * in.irradiance;
     if (is_zero(f)) continue;
     const Vec3 x = s.start(in.d);
-    if (may_hit(x, in.d)) {
+    if (bounds_.may_hit(x, in.d)) {
       ++path.rays;
       f *= objects_->transmittance(x, in.d, in.t);
       if (is_zero(f)) continue;
@@ -194,7 +194,7 @@ Vec3 Compositor::delta_change(Vec3 x, Vec3 n, Path& path) const {
     const float cos = dot(in.d, n);
     if (!(cos > 0) || is_zero(in.irradiance)) continue;
     Vec3 E = cos * in.irradiance;
-    if (may_hit(x, in.d)) {
+    if (bounds_.may_hit(x, in.d)) {
       ++path.rays;
       E *= objects_->transmittance(x, in.d, in.t);
       if (is_zero(E)) continue;
