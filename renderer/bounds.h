@@ -75,11 +75,62 @@ class Cones {
     bool inside;
   };
   void add(Vec3 x, const Sphere& s, uint32_t node);
+  void refine(Vec3 x, const Bounds& bounds);
 
   Cone cone_[kMost];
   int count_ = 0;
   float weights_ = 0;
   Vec3 n_;
 };
+
+inline Cones::Cones(Vec3 x, Vec3 n, const Bounds& bounds) : n_(n) {
+  if (bounds.leaves().size() <= size_t(kMost)) {
+    for (const Sphere& s : bounds.leaves()) add(x, s, 0);
+  } else {
+    refine(x, bounds);
+  }
+  for (int k = 0; k < count_; ++k) weights_ += cone_[k].weight;
+}
+
+inline void Cones::add(Vec3 x, const Sphere& s, uint32_t node) {
+  const Vec3 to = s.centre - x;
+  const float height = dot(to, n_), distance2 = length2(to), r2 = s.radius * s.radius;
+  if (height <= -s.radius) return;
+  if (distance2 <= r2 * 1.0001f) {
+    cone_[count_++] = {0, 0, 0, 0, kPi, node, true};
+    return;
+  }
+  const float distance = std::sqrt(distance2), sine2 = r2 / distance2;
+  const float cosine = std::sqrt(1 - sine2);
+  const float solid_angle = 2 * kPi * sine2 / (1 + cosine);  // 2 pi (1 - cosine)
+  const float rise = std::min(1.0f, height / distance + s.radius / distance);
+  const Vec3 axis = to * (1 / distance);
+  cone_[count_++] = {axis.x, axis.y, axis.z, cosine, solid_angle * rise, node, false};
+}
+
+inline Vec3 Cones::sample(Pair u) const {
+  float left = u.x * weights_;
+  int k = 0;
+  while (k + 1 < count_ && left >= cone_[k].weight) left -= cone_[k++].weight;
+  const Cone& c = cone_[k];
+  const float rest = std::min(left / c.weight, 0x1.fffffep-1f);
+  if (c.inside) return Frame(n_).world(sample_cosine(rest, u.y));
+  const float z = 1 - rest * (1 - c.cosine);
+  const float r = std::sqrt(std::max(0.0f, 1 - z * z)), phi = 2 * kPi * u.y;
+  return normalize(Frame({c.x, c.y, c.z}).world({r * std::cos(phi), r * std::sin(phi), z}));
+}
+
+inline float Cones::density(Vec3 d) const {
+  float sum = 0;
+  for (int k = 0; k < count_; ++k) {
+    const Cone& c = cone_[k];
+    if (c.inside) {
+      sum += c.weight * std::max(0.0f, dot(d, n_)) / kPi;
+    } else if (d.x * c.x + d.y * c.y + d.z * c.z >= c.cosine) {
+      sum += c.weight / (2 * kPi * (1 - c.cosine));
+    }
+  }
+  return sum / weights_;
+}
 
 }  // namespace chromeball
