@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from chromeball.renderer import core
 from chromeball.renderer.delta_light import DeltaLight
 from chromeball.renderer.mesh import Instance, Mesh, Values, affine
-from chromeball.renderer.world import world
+from chromeball.renderer.world import moved_back, triple, world
 from chromeball.scene.errors import UserError
 from chromeball.scene.pose import Pose
 from chromeball.stand_in.ply import StandInMesh
@@ -178,11 +178,13 @@ class Compositor:
         self._plate_samples = plate_samples
         self._inner = _inner(objects)
         self._lights = lights
+        #: the core counts from the map's place
+        self._about = np.asarray(captured.origin, float)
         self._core = core.Compositor(
-            world(objects, lights),
-            _core_stand_in(captured.stand_in),
+            world(objects, lights, captured.origin),
+            _core_stand_in(captured.stand_in, captured.origin),
             self._environment,
-            _triple(captured.origin),
+            (0.0, 0.0, 0.0),
             bounces,
             seed,
             samples,
@@ -199,7 +201,7 @@ class Compositor:
     ) -> None:
         """Start over with another camera and plate; the world stays as it is built."""
         self._rays = np.ascontiguousarray(rays, np.float32)
-        self._camera = _triple(camera)
+        self._camera = triple(np.subtract(camera, self._about))
         if plate is None:
             plate = self._core.background(self._rays, self._camera, self._plate_samples)
         self.plate = np.ascontiguousarray(plate, np.float32)
@@ -220,7 +222,9 @@ class Compositor:
 
         Camera, plate and captured set stay as they are.
         """
-        self._core.place(world(objects, self._lights if lights is None else lights))
+        self._core.place(
+            world(objects, self._lights if lights is None else lights, self._about)
+        )
         self._lights = self._lights if lights is None else lights
         self._inner = _inner(objects)
         self._moved()
@@ -232,7 +236,7 @@ class Compositor:
         :class:`Instance`, whose ``inner`` stays. Raises IndexError where there is no such
         object.
         """
-        self._core.move(k, affine(pose, scale, self._inner[k]))
+        self._core.move(k, moved_back(affine(pose, scale, self._inner[k]), self._about))
         self._moved()
 
     def _moved(self) -> None:
@@ -323,7 +327,9 @@ class Compositor:
 
     def irradiance(self, point: Values, normal: Values) -> NDArray[np.float64]:
         """E_without (3,) of the captured set at a point lifted off a surface."""
-        return np.array(self._core.irradiance(_triple(point), _triple(normal)))
+        return np.array(
+            self._core.irradiance(triple(np.subtract(point, self._about)), triple(normal))
+        )
 
     def picture(self) -> NDArray[np.float32]:
         """The composite alone, (H, W, 3); as :meth:`result`, without its layers."""
@@ -406,11 +412,6 @@ def _neighbourhood(values: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.sqrt(np.maximum(uniform_filter(values**2, size=7, mode="nearest"), 0))
 
 
-def _triple(value: Values) -> tuple[float, float, float]:
-    x, y, z = (float(v) for v in np.asarray(value, float))
-    return x, y, z
-
-
 def _float32(values: NDArray[np.floating]) -> NDArray[np.float32]:
     return values.astype(np.float32, copy=False)
 
@@ -436,13 +437,13 @@ def check_environment(environment: NDArray[np.float32]) -> None:
         )
 
 
-def _core_stand_in(mesh: StandInMesh | None) -> core.StandIn:
+def _core_stand_in(mesh: StandInMesh | None, about: NDArray[np.float64]) -> core.StandIn:
     if mesh is None:
         none = np.zeros((0, 3), np.float32)
         return core.StandIn(none, none, np.zeros((0, 3), np.uint32), np.zeros(0, np.uint8))
     return core.StandIn(
-        np.ascontiguousarray(mesh.vertices, np.float32),
-        np.ascontiguousarray(mesh.original, np.float32),
+        (mesh.vertices - about).astype(np.float32),
+        (mesh.original - about).astype(np.float32),
         np.ascontiguousarray(mesh.faces, np.uint32),
         np.ascontiguousarray(mesh.surface, np.uint8),
     )

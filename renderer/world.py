@@ -6,18 +6,26 @@ from collections.abc import Sequence
 from typing import get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 from chromeball.renderer import core
 from chromeball.renderer.delta_light import DeltaLight
 from chromeball.renderer.material import Material, Texture, Wrap
-from chromeball.renderer.mesh import Instance, Mesh
+from chromeball.renderer.mesh import Instance, Mesh, Values
 
 _ALPHA_MODES = ("opaque", "mask", "blend")
 _WRAPS: tuple[Wrap, ...] = get_args(Wrap.__value__)
 
 
-def world(objects: Sequence[Mesh | Instance], lights: Sequence[DeltaLight] = ()) -> core.World:
+def world(
+    objects: Sequence[Mesh | Instance],
+    lights: Sequence[DeltaLight] = (),
+    about: Values = (0.0, 0.0, 0.0),
+) -> core.World:
     """The core's scene of these objects, in their order; a mesh stands where its vertices are.
+
+    The core counts from the place ``about``, so that its float32 are fine where the scene is,
+    however far that is from the world's origin.
 
     Objects that share a :class:`Mesh` share one copy of it and one BVH; materials and textures
     that are equal are stored once.
@@ -76,10 +84,26 @@ def world(objects: Sequence[Mesh | Instance], lights: Sequence[DeltaLight] = ())
 
     for thing in objects:
         instance = thing if isinstance(thing, Instance) else Instance(thing)
-        built.place(mesh(instance.mesh), instance.matrix())
+        built.place(mesh(instance.mesh), moved_back(instance.matrix(), about))
     for light in lights:
+        p = light.position
         built.add_light(
-            light.position, light.intensity, light.direction, light.cos_inner, light.cos_outer
+            None if p is None else triple(np.subtract(p, about)),
+            light.intensity,
+            light.direction,
+            light.cos_inner,
+            light.cos_outer,
         )
     built.commit()
     return built
+
+
+def moved_back(matrix: NDArray[np.float64], about: Values) -> NDArray[np.float64]:
+    """A (3, 4) transform into coordinates that count from ``about``."""
+    return np.column_stack([matrix[:, :3], matrix[:, 3] - np.asarray(about, float)])
+
+
+def triple(value: Values) -> tuple[float, float, float]:
+    """Three numbers as the core takes them."""
+    x, y, z = (float(v) for v in np.asarray(value, float))
+    return x, y, z
