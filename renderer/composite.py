@@ -211,7 +211,7 @@ class Compositor:
         corners = np.isfinite(self._rays).all(axis=2)
         #: pixels inside the lens; the core leaves the others out
         self._seen = corners[1:, 1:] & corners[1:, :-1] & corners[:-1, 1:] & corners[:-1, :-1]
-        self._start()
+        self.restart()
 
     def place(
         self,
@@ -242,9 +242,10 @@ class Compositor:
     def _moved(self) -> None:
         if self._direct is not None:
             self._direct.objects_moved()
-        self._start()
+        self.restart()
 
-    def _start(self) -> None:
+    def restart(self) -> None:
+        """Forget all samples."""
         if self._direct is None:
             self._film = np.zeros((*self.plate.shape[:2], _COUNT), np.float32)
         else:

@@ -39,16 +39,16 @@ std::vector<uint32_t> hilbert_order(int h, int w) {
 // What each texel has above a share of the mean over the sphere, times its solid angle.
 std::vector<float> power_above(float share_of_mean, const std::vector<float>& rgb, int h,
                                int w) {
-  const auto solid_angle = [&](size_t t) {
-    const double y = double(t / w);
-    return 2 * M_PI / w * (std::cos(M_PI * y / h) - std::cos(M_PI * (y + 1) / h));
-  };
+  std::vector<double> solid_angle(h);  // of a texel of each row
+  for (int y = 0; y < h; ++y) {
+    solid_angle[y] = 2 * M_PI / w * (std::cos(M_PI * y / h) - std::cos(M_PI * (y + 1) / h));
+  }
   std::vector<float> power(rgb.size() / 3);
   double sum = 0;
-  for (size_t t = 0; t < power.size(); ++t) sum += mean(Vec3(&rgb[3 * t])) * solid_angle(t);
+  for (size_t t = 0; t < power.size(); ++t) sum += mean(Vec3(&rgb[3 * t])) * solid_angle[t / w];
   const double level = sum / (4 * M_PI) * share_of_mean;
   for (size_t t = 0; t < power.size(); ++t) {
-    power[t] = float(std::max(0.0, mean(Vec3(&rgb[3 * t])) - level) * solid_angle(t));
+    power[t] = float(std::max(0.0, mean(Vec3(&rgb[3 * t])) - level) * solid_angle[t / w]);
   }
   return power;
 }
