@@ -202,10 +202,12 @@ class Compositor:
         """Start over with another camera and plate; the world stays as it is built."""
         self._rays = np.ascontiguousarray(rays, np.float32)
         self._camera = triple(np.subtract(camera, self._about))
+        height, width = self._rays.shape[0] - 1, self._rays.shape[1] - 1
+        if height < 1 or width < 1:
+            raise UserError(f"a picture of {height} x {width} has no pixels")
         if plate is None:
             plate = self._core.background(self._rays, self._camera, self._plate_samples)
         self.plate = np.ascontiguousarray(plate, np.float32)
-        height, width = self._rays.shape[0] - 1, self._rays.shape[1] - 1
         if self.plate.shape != (height, width, 3):
             raise ValueError(f"plate is {self.plate.shape}, rays are for {height} x {width}")
         corners = np.isfinite(self._rays).all(axis=2)

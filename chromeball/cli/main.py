@@ -82,6 +82,9 @@ def main() -> None:
     except UserError as error:
         _complain(str(error))
         sys.exit(error.exit_code)
+    except MemoryError as error:
+        _complain(f"not enough memory: {error}")
+        sys.exit(1)
     except KeyboardInterrupt:
         sys.exit(130)
     except BrokenPipeError:
