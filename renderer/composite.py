@@ -171,8 +171,6 @@ class Compositor:
             if plate is None:
                 raise UserError("ambient occlusion has no light to show: it needs a plate")
             captured = even_light(captured.stand_in, np.asarray(camera, float))
-        if lights and integrator != "path":
-            raise UserError("lights without size are for the path integrator")
         self._difference = mode == "difference"
         self._environment = np.ascontiguousarray(captured.environment, np.float32)
         self._plate_samples = plate_samples

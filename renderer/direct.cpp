@@ -209,6 +209,12 @@ struct Direct::GatherRays {
     give(a, a.weight * s.emission);
     if (!direct.bounces_ || s.model != Model::diffuse) return;
     const Vec3 start = s.p + s.rise * s.ng;
+    if (!objects.delta_lights().empty()) {
+      Sampler sampler(direct.scene_.table_, direct.seed_, uint32_t(a.u * 0x1p24f));
+      Compositor::Path path{sampler};
+      give(a, a.weight * direct.scene_.delta_light(s, -d, path));
+      traced += path.rays;
+    }
     if (direct.captured_.positional()) {
       const Vec3 look = Frame(s.ns).world(sample_cosine(a.v.x, a.v.y));
       if (dot(look, s.ng) > 0) {
@@ -536,6 +542,8 @@ uint64_t Direct::shade(const PixelRays& rays, Vec3 camera, int samples, int x0, 
   sums.assign(tile.receivers.size(), {});
   static thread_local std::vector<Sums> sent;  // by objects
   sent.assign(tile.receivers.size(), {});
+  static thread_local std::vector<Vec3> lit;  // by lights without size
+  lit.assign(tile.receivers.size(), {});
   const auto ask = [&](const Tile::Group& g, Vec3 x, float u, Vec3* sum, Vec3* square) {
     const size_t m = g.choices.size();
     const auto& c = g.list->choices[g.choices[std::min(m - 1, size_t(u * float(m)))]];
@@ -608,6 +616,20 @@ uint64_t Direct::shade(const PixelRays& rays, Vec3 camera, int samples, int x0, 
   gather.flush();
   near.flush();
   shadows.flush();
+  // lights without size: no noise, so that one ray each is enough
+  uint64_t traced = 0;
+  const bool lights = !scene_.objects_->delta_lights().empty();
+  const auto delta_change = [&](Vec3 x, Vec3 n, size_t pixel) {
+    Sampler sampler(scene_.table_, seed_ + pixel, uint32_t(passes_));
+    Compositor::Path path{sampler};
+    const Vec3 dE = scene_.delta_change(x + clearance(x, camera) * n, n, path);
+    traced += path.rays;
+    return dE;
+  };
+  for (size_t k = 0; lights && k < tile.receivers.size(); ++k) {
+    const Tile::Receiver& r = tile.receivers[k];
+    if (r.pixel != kNowhere) lit[k] = delta_change(r.x, normal_of(r.plane), r.pixel);
+  }
 
   // E is smooth: one value for 4 x 4 pixels of a plane
   struct Known {
@@ -628,9 +650,10 @@ uint64_t Direct::shade(const PixelRays& rays, Vec3 camera, int samples, int x0, 
   const size_t number = size_t(y0 / kTile) * tiles_across() + x0 / kTile;
   bool anything = !tile.samples.empty();
   for (const Sums& one : sent) anything |= !is_zero(one.sum);
+  for (const Vec3& one : lit) anything |= !is_zero(one);
   for (size_t k = 0; k < tile.count; ++k) anything |= !tile.groups[k].choices.empty();
   if (!touched_[number]) {
-    if (!anything) return shadows.traced + gather.traced + near.traced;
+    if (!anything) return traced + shadows.traced + gather.traced + near.traced;
     if (!film_[number]) film_[number] = std::make_unique<FilmTile>();
     *film_[number] = {};
     touched_[number] = 1;
@@ -649,13 +672,14 @@ uint64_t Direct::shade(const PixelRays& rays, Vec3 camera, int samples, int x0, 
     const int at = film_pixel(i);
     film.set.share[at] += 1;
     film.set.group[at] = float(r.plane + 1);
-    const bool changes = !is_zero(sent[k].sum);
-    if (g.choices.empty() && !changes) continue;
+    const Vec3 more = sent[k].sum + lit[k];
+    if (g.choices.empty() && is_zero(more)) continue;
     const Vec3 E = irradiance(i, face_[i], r.x, r.plane);
-    if (changes) {
-      const Vec3 q = over(sent[k].sum, E);
+    if (!is_zero(more)) {
+      const Vec3 q = over(more, E);
       film.set.r[at] += q.x, film.set.g[at] += q.y, film.set.b[at] += q.z;
-      film.set.variance[at] += mean(q) * mean(q);
+      const float noisy = mean(over(sent[k].sum, E));
+      film.set.variance[at] += noisy * noisy;
     }
     if (g.choices.empty()) continue;
     const Share share = share_of(g);
@@ -671,7 +695,6 @@ uint64_t Direct::shade(const PixelRays& rays, Vec3 camera, int samples, int x0, 
   // sub-samples where objects are
   const float whole = 1 / float(samples);
   Packet packet;
-  uint64_t traced = 0;
   for (size_t first = 0; first < tile.samples.size(); first += Packet::kWidth) {
     const int count = int(std::min<size_t>(Packet::kWidth, tile.samples.size() - first));
     packet.clear();
@@ -711,6 +734,12 @@ uint64_t Direct::shade(const PixelRays& rays, Vec3 camera, int samples, int x0, 
         }
         s.albedo = surface.base;
         s.other = surface.emission;
+        if (lights) {
+          Sampler sampler(scene_.table_, seed_ + s.pixel, uint32_t(passes_ * samples + s.i));
+          Compositor::Path path{sampler};
+          s.other += scene_.delta_light(surface, -s.d, path);
+          traced += path.rays;
+        }
         const Vec3 start = surface.p + surface.rise * surface.ng;
         const LightLists::List& list = this->list(s.group, LightLists::bin_of(s.n));
         const size_t m = list.choices.size();
@@ -751,6 +780,7 @@ uint64_t Direct::shade(const PixelRays& rays, Vec3 camera, int samples, int x0, 
             ask(g, camera + s.t * s.d, (float(j) + shift) / float(s.rays), &s.value, &s.square);
           }
         }
+        if (lights) s.other += delta_change(camera + s.t * s.d, normal_of(plane), s.pixel);
         if (gathers) {
           const int px = int(s.pixel % width_), py = int(s.pixel / width_);
           const Pair a = spread(uint32_t(passes_ * samples + s.i));

@@ -11,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from chromeball.renderer.composite import CapturedSet, Compositor
+from chromeball.renderer.delta_light import DeltaLight
 from chromeball.renderer.mesh import Kind, Mesh
 from chromeball.renderer.path import corner_rays
 from chromeball.renderer.primitives import box, sphere
@@ -267,3 +268,18 @@ def test_what_is_kept_and_what_is_added_make_the_picture(mode: str) -> None:
     job.add(4)
     result = job.result()
     np.testing.assert_allclose(result.kept * plate + result.added, result.rgb, atol=2e-6)
+
+
+def test_a_point_light_adds_what_path_says_and_its_shadow_is_sharp() -> None:
+    lamp = DeltaLight((0.8, 1.2, 0.6), (1.5, 1.4, 1.0))
+    objects = [ball((0.0, 0.3, 0.0), 0.25)]
+    truth = compositor(objects, floor(), window_light(), "path", lights=[lamp])
+    truth.add(512)
+    job = compositor(objects, floor(), window_light(), lights=[lamp])
+    job.add(64)
+    a, b = truth.result(), job.result()
+    assert b.objects.sum() == pytest.approx(a.objects.sum(), rel=0.01)
+    ground = (a.alpha == 0) & (b.alpha == 0)
+    assert a.quotient[ground].max() > 1.1
+    assert b.quotient[ground].mean() == pytest.approx(a.quotient[ground].mean(), rel=4e-3)
+    assert float(np.quantile(np.abs(b.quotient - a.quotient)[ground], 0.95)) < 0.04
