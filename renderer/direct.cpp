@@ -59,6 +59,7 @@ struct Direct::Tile {
     bool on_object = false;
     uint32_t group = kNowhere;
     float t = kInfinity;
+    Vec3 share{1, 1, 1};  // of what is seen that comes through panes in front
     Vec3 n{}, albedo{}, other{};
     Vec3 value{};   // irradiance of the object; dE of the set
     Vec3 square{};  // of each ray's, summed
@@ -218,7 +219,7 @@ struct Direct::GatherRays {
     if (direct.captured_.positional()) {
       const Vec3 look = Frame(s.ns).world(sample_cosine(a.v.x, a.v.y));
       if (dot(look, s.ng) > 0) {
-        near->push(start, look, {a.sum, a.square, a.weight * s.base, 0, {}, true});
+        near->push(start, look, {a.sum, a.square, a.weight * s.alpha * s.base, 0, {}, true});
       }
     }
     const LightLists::List& list =
@@ -229,7 +230,7 @@ struct Direct::GatherRays {
     const float cos = dot(in.d, s.ns);
     if (cos <= 0 || in.share == 0 || dot(in.d, s.ng) <= 0) return;
     const Vec3 light =
-        (in.share * cos * float(list.size()) / kPi) * a.weight * s.base * c.flux;
+        (in.share * cos * float(list.size()) / kPi) * a.weight * s.alpha * s.base * c.flux;
     shadows.push(start, in.d, in.t * (1 - 1e-3f), {a.sum, a.square, light, false, true});
   }
 
@@ -720,7 +721,17 @@ uint64_t Direct::shade(const PixelRays& rays, Vec3 camera, int samples, int x0, 
     for (int k = 0; k < count; ++k) {
       Tile::Sample& s = tile.samples[first + k];
       s.t = packet.rays.ray.tfar[k];
-      if (const Hit hit = hits[k]) {
+      Hit hit = hits[k];
+      if (hit && scene_.objects_->material(hit).transmits) {  // look through
+        Sampler sampler(scene_.table_, seed_ + s.pixel, uint32_t(passes_ * samples + s.i));
+        Compositor::Path path{sampler};
+        const auto met = scene_.meet(camera, s.d, s.share, path);
+        traced += path.rays;
+        hit = met.hit;
+        s.t = met.hit ? met.hit.t : met.place.t;
+        face[k] = met.place ? met.place.face : kNowhere;
+      }
+      if (hit) {
         s.on_object = true;
         const Surface surface = scene_.objects_->surface_at(hit, s.d);
         s.n = surface.ns;
@@ -728,16 +739,16 @@ uint64_t Direct::shade(const PixelRays& rays, Vec3 camera, int samples, int x0, 
         if (surface.model != Model::diffuse) {
           Sampler sampler(scene_.table_, seed_ + s.pixel, uint32_t(passes_ * samples + s.i));
           Compositor::Path path{sampler};
-          s.other = scene_.object_radiance(hit, s.d, 0, path);
+          s.other = s.share * scene_.object_radiance(hit, s.d, 0, path);
           traced += path.rays;
           continue;
         }
-        s.albedo = surface.base;
-        s.other = surface.emission;
+        s.albedo = surface.alpha * s.share * surface.base;
+        s.other = s.share * surface.emission;
         if (lights) {
           Sampler sampler(scene_.table_, seed_ + s.pixel, uint32_t(passes_ * samples + s.i));
           Compositor::Path path{sampler};
-          s.other += scene_.delta_light(surface, -s.d, path);
+          s.other += s.share * scene_.delta_light(surface, -s.d, path);
           traced += path.rays;
         }
         const Vec3 start = surface.p + surface.rise * surface.ng;
@@ -813,16 +824,22 @@ uint64_t Direct::shade(const PixelRays& rays, Vec3 camera, int samples, int x0, 
         film.other[0][at] += whole * s.other.x, film.other[1][at] += whole * s.other.y;
         film.other[2][at] += whole * s.other.z;
         tile.on_object[at].add(mean(s.value));
-      } else if (s.group != kNowhere) {
-        const uint32_t plane = plane_at(s.group, s.d);
-        film.set.share[at] += whole;
-        film.set.group[at] = float(plane + 1);
-        if (s.rays || !is_zero(s.other)) {
+      } else {
+        // (1 + dE / E) of the plate's radiance, and of that what comes through panes
+        Vec3 q;
+        const bool support = s.group != kNowhere;
+        const uint32_t plane = support ? plane_at(s.group, s.d) : 0;
+        if (support && (s.rays || !is_zero(s.other))) {
           const Vec3 E = irradiance(s.pixel, s.group, camera + s.t * s.d, plane);
-          const Vec3 q = over(s.value, E) * (1 / float(std::max(1, s.rays))) + over(s.other, E);
-          film.set.r[at] += whole * q.x, film.set.g[at] += whole * q.y, film.set.b[at] += whole * q.z;
-          tile.on_set[at].add(mean(q));
+          q = over(s.value, E) * (1 / float(std::max(1, s.rays))) + over(s.other, E);
         }
+        q = s.share * (Vec3(1.0f) + q) - Vec3(1.0f);
+        if (!support && is_zero(q)) continue;
+        film.set.share[at] += whole;
+        film.set.group[at] = support ? float(plane + 1) : -1;
+        if (is_zero(q)) continue;
+        film.set.r[at] += whole * q.x, film.set.g[at] += whole * q.y, film.set.b[at] += whole * q.z;
+        tile.on_set[at].add(mean(q));
       }
   }
   for (int at = 0; at < FilmTile::kPixels; ++at) {

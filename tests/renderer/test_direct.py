@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from chromeball.renderer.composite import CapturedSet, Compositor
 from chromeball.renderer.delta_light import DeltaLight
+from chromeball.renderer.material import Material
 from chromeball.renderer.mesh import Kind, Mesh
 from chromeball.renderer.path import corner_rays
 from chromeball.renderer.primitives import box, sphere
@@ -283,3 +284,21 @@ def test_a_point_light_adds_what_path_says_and_its_shadow_is_sharp() -> None:
     assert a.quotient[ground].max() > 1.1
     assert b.quotient[ground].mean() == pytest.approx(a.quotient[ground].mean(), rel=4e-3)
     assert float(np.quantile(np.abs(b.quotient - a.quotient)[ground], 0.95)) < 0.04
+
+
+def test_a_pane_and_a_cut_out_let_the_plate_through() -> None:
+    v = np.array([[-0.5, 0.2, 0.6], [0.5, 0.2, 0.6], [0.5, 0.9, 0.6], [-0.5, 0.9, 0.6]])
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    pane = Material((0.9, 0.6, 0.3), roughness=0.0, transmission=1.0, thin=True)
+    half = Material((0.8, 0.2, 0.2), specular=0.0, alpha=0.5, alpha_mode="blend")
+    for material in (pane, half):
+        mesh = Mesh.of(v, faces, material=material)
+        truth = compositor([mesh], floor(), window_light(), "path")
+        truth.add(256)
+        job = compositor([mesh], floor(), window_light())
+        job.add(128)
+        a, b = truth.picture(), job.picture()
+        changed = truth.result().changed
+        assert changed.mean() > 0.1
+        # what the pane mirrors onto the floor is left to path
+        assert b[changed].mean(axis=0) == pytest.approx(a[changed].mean(axis=0), rel=0.02)
