@@ -76,7 +76,7 @@ class Task:
 
     ``frame``: none for a still. ``output``: the EXR of the whole picture, ``%04d`` in it being
     the frame's number; none: ``VIEW.exr`` or ``VIEW.%04d.exr`` in the scene's folder.
-    ``integrator``: another than the scene file's.
+    ``integrator``: another than the scene file's; ``denoise``: whatever it says.
     """
 
     scene_file: str
@@ -86,6 +86,7 @@ class Task:
     tile: Tile | None = None
     output: str | None = None
     integrator: Integrator | None = None
+    denoise: bool = False
 
     def __str__(self) -> str:
         frame = "" if self.frame is None else f" frame {self.frame}"
@@ -172,9 +173,12 @@ class _Picture:
         view = next((v for v in scene.view if v.name == task.view), None)
         if view is None:
             raise UserError(f"there is no [[view]] named {task.view!r}", file=file)
+        render = scene.render
         if task.integrator is not None:
-            render = msgspec.structs.replace(scene.render, integrator=task.integrator)
-            scene = msgspec.structs.replace(scene, render=render)
+            render = msgspec.structs.replace(render, integrator=task.integrator)
+        if task.denoise:
+            render = msgspec.structs.replace(render, denoise=True)
+        scene = msgspec.structs.replace(scene, render=render)
         if task.tile is not None and scene.render.integrator != "path":
             raise UserError("tiles are for the path integrator: direct makes whole frames")
         number = "" if task.frame is None else f".{task.frame:04d}"

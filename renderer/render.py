@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chromeball.renderer.composite import CapturedSet, Composite, Compositor, even_light
+from chromeball.renderer.denoise import denoise
 from chromeball.renderer.exposed import expose
 from chromeball.renderer.inputs import scene_inputs
 from chromeball.renderer.lights import area_lights, delta_lights
@@ -71,6 +72,7 @@ class Job:
     exposure: float | None
     inputs: tuple[Path, ...]
     look: CameraLook
+    denoise: bool = False
 
 
 def prepare(scene: Scene, folder: Path, view: View, spp: int) -> Job:
@@ -149,7 +151,16 @@ def prepare(scene: Scene, folder: Path, view: View, spp: int) -> Job:
     )
     look, read = read_look(view.look, scene, folder, plate_file, compositor.plate, camera)
     inputs += read
-    return Job(view.name, compositor, captured, camera.size, view.exposure, tuple(inputs), look)
+    return Job(
+        view.name,
+        compositor,
+        captured,
+        camera.size,
+        view.exposure,
+        tuple(inputs),
+        look,
+        scene.render.denoise,
+    )
 
 
 def virtual_camera(view: View, origin: NDArray[np.float64]) -> CameraModel:
@@ -252,7 +263,10 @@ def write_composite(stage: Stage, job: Job, composite: Composite, target: Path) 
     The EXR holds R G B A, ``quotient.R G B``, ``objects.R G B`` (premultiplied),
     ``error.Y`` (standard error of the brightness) and ``depth.Z`` in metres.
     """
-    seconds, relative_error = stage.elapsed(), composite.relative_error()
+    relative_error = composite.relative_error()
+    if job.denoise:
+        composite = denoise(composite, job.compositor.plate)
+    seconds = stage.elapsed()
     composite, added = apply_look(composite, job.compositor.plate, job.look)
     exposure = job.exposure or automatic_exposure(composite.rgb)
     png = target.with_suffix(".png")
@@ -269,6 +283,7 @@ def write_composite(stage: Stage, job: Job, composite: Composite, target: Path) 
         "relative_error": relative_error if job.compositor.samples > 1 else None,
         "median_standard_error": float(np.median(relative)) if relative.size else 0.0,
         "changed_pixels": int(changed.sum()),
+        "denoised": job.denoise,
         "coverage": float(composite.alpha.mean()),
         "clipped_negative_pixels": composite.clipped,
         "clipped_png_pixels": int(clipped.sum()),

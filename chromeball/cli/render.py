@@ -33,6 +33,7 @@ def render(
     seconds: float | None = None,
     error: float | None = None,
     integrator: Literal["path", "direct", "ao"] | None = None,
+    denoise: Annotated[bool, Parameter(negative="")] = False,
     output: Annotated[Path | None, Parameter(alias="-o")] = None,
     json_: Annotated[bool, Parameter(name="--json", negative="")] = False,
 ) -> None:
@@ -67,6 +68,9 @@ def render(
         path: all light between objects and set, the reference. direct: many times faster, the
         set's light on the objects and their shadows. ao: direct under a white sky, for a plate
         without a light probe. By default what the scene file says, else path.
+    denoise
+        Smooth the objects and their shadows, not the plate, by Open Image Denoise (the extra
+        denoise).
     output
         The EXR, by default VIEW.exr in the scene's build folder, VIEW.%04d.exr for frames.
     json_
@@ -96,6 +100,7 @@ def render(
             part,
             None if output is None else str(output),
             integrator,
+            denoise,
         )
         for number in numbers
         for part in parts

@@ -494,10 +494,12 @@ class Render(Table, frozen=True):
 
     ``integrator``: ``path`` is the reference, all light between objects and set (``bounces``);
     ``direct`` the fast one: light of the set on the objects and their shadows; ``ao`` the same
-    under an even white sky, for a plate without a light probe.
+    under an even white sky, for a plate without a light probe. ``denoise``: Open Image Denoise
+    smooths what is kept of the plate and what is added to it, not the plate.
     """
 
     integrator: Literal["path", "direct", "ao"] = "path"
+    denoise: bool = False
     spp: Annotated[int, Meta(ge=1)] = 64
     seed: int = 0
     bounces: Annotated[int, Meta(ge=0)] = 2
