@@ -10,7 +10,7 @@ import json
 import os
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ import msgspec
 from chromeball.renderer.inputs import scene_inputs
 from chromeball.scene.errors import UserError
 from chromeball.scene.manifest import Bracket, Lens, Meter, Quad, Scene, View
+from chromeball.scene.sequence import at, frames_of, moves
 
 # the suffixes of `chromeball.scene.image`, which is too heavy to import for a plan
 RAW_SUFFIXES = frozenset(
@@ -122,7 +123,8 @@ class _Planner:
         plan += [self._pose(view) for view in scene.view]
         plan += self._stand_in()
         plan.append(self._lights())
-        plan += [self._render(view) for view in scene.view]
+        for view in scene.view:
+            plan += self._render(view)
         plan.append(self._report(plan))
         return plan
 
@@ -626,11 +628,31 @@ class _Planner:
             {},
         )
 
-    def _render(self, view: View) -> StagePlan:
+    def _render(self, view: View) -> Iterator[StagePlan]:
+        """The view's picture, or a stage for each frame of a sequence."""
         name = f"render {view.name}"
         scene = self.scene
         if not scene.object and not scene.light:
-            return StagePlan(name, False, "no [[object]]")
+            yield StagePlan(name, False, "no [[object]]")
+            return
+        if not moves(scene, view):
+            yield self._picture(name, scene, view, f"{view.name}.exr")
+            return
+        frames = frames_of(view)
+        if not frames:
+            raise UserError(f'view {view.name!r} is a sequence: say which, frames = "1-48"')
+        index = scene.view.index(view)
+        for frame in frames:
+            still = at(scene, frame)
+            plan = self._picture(
+                f"{name} {frame:04d}", still, still.view[index], f"{view.name}.{frame:04d}.exr"
+            )
+            output = f"{self.build}/{view.name}.%04d.exr"
+            # make knows what is to be done again, by time: what is kept would stay old
+            more = ("--frames", str(frame), "--force")
+            yield replace(plan, command=(*plan.command[:-1], output, *more))
+
+    def _picture(self, name: str, scene: Scene, view: View, picture: str) -> StagePlan:
         inputs = [self._env()]
         if scene.stand_in:
             inputs.append(f"{self.build}/stand_in.ply")
@@ -638,20 +660,21 @@ class _Planner:
             inputs.append(f"{self.build}/{view.bracket}.exr")
         if view.plate:
             inputs.append(view.plate)
-        if view.points and view in self.plates:
+        if view.points and (view.bracket or view.plate):
             inputs.append(f"{self.build}/{view.name}.cameramodel")
         elif view.camera:
             inputs.append(view.camera)
         inputs += [os.path.relpath(path, self.root) for path in scene_inputs(scene, self.root)]
-        picture = f"{self.build}/{view.name}.exr"
-        pictures = [picture, f"{self.build}/{view.name}.png"]
+        picture = f"{self.build}/{picture}"
+        stem = picture.removesuffix(".exr")
+        pictures = [picture, f"{stem}.png"]
         look = view.look
         if look.response is not None:
             solved = scene.hdr.response or f"{self.build}/response.json"
             inputs.append(solved if look.response == "plate" else look.response)
-            pictures.append(f"{self.build}/{view.name}.camera.png")
+            pictures.append(f"{stem}.camera.png")
         if look.jpeg is not None:
-            pictures.append(f"{self.build}/{view.name}.camera.jpg")
+            pictures.append(f"{stem}.camera.jpg")
         counts = (("object", len(scene.object)), ("light", len(scene.light)))
         things = [f"{n} {what}{'s' if n > 1 else ''}" for what, n in counts if n]
         return StagePlan(

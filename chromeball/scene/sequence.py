@@ -9,14 +9,14 @@ turn at constant speed about one axis from key to key the shorter way (slerp, Sh
 
 from __future__ import annotations
 
+import bisect
+import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 import msgspec
-import numpy as np
-from numpy.typing import NDArray
 
 from chromeball.scene.errors import UserError
 from chromeball.scene.manifest import Object, Scene, Vector, View, parse_frames
@@ -77,13 +77,13 @@ def object_at(entry: Object, time: int | float) -> Object:
         return entry
     position = [(k.frame, k.position) for k in entry.key if k.position is not None]
     rotation = [(k.frame, k.rotation) for k in entry.key if k.rotation is not None]
-    scale = [(k.frame, _sides(k.scale)) for k in entry.key if k.scale is not None]
-    sides = _interpolate([(t, tuple(np.log(s))) for t, s in scale], time, entry.interpolation)
+    scale = [(k.frame, _logarithms(k.scale)) for k in entry.key if k.scale is not None]
+    sides = _interpolate(scale, time, entry.interpolation)
     return msgspec.structs.replace(
         entry,
         position=_vector(_interpolate(position, time, entry.interpolation), entry.position),
         rotation=_turn(rotation, time) or entry.rotation,
-        scale=entry.scale if sides is None else _vector(np.exp(sides), (1.0, 1.0, 1.0)),
+        scale=entry.scale if sides is None else _exponentials(sides),
         key=[],
     )
 
@@ -104,7 +104,7 @@ def view_at(view: View, time: int | float) -> View:
         look_at=_vector(_interpolate(look_at, time, view.interpolation), view.look_at),
         rotation=_turn(rotation, time) or view.rotation,
         # a cubic curve may swing a little beyond its keys
-        fov=view.fov if angle is None else float(np.clip(angle[0], 1e-3, 360)),
+        fov=view.fov if angle is None else min(max(angle[0], 1e-3), 360.0),
         key=[],
     )
 
@@ -147,47 +147,61 @@ def _interpolate(
     keys: Sequence[tuple[float, Sequence[float]]],
     time: int | float,
     interpolation: Interpolation,
-) -> NDArray[np.float64] | None:
-    """Values (n,) at a time among keys (frame, values), held outside; None without keys."""
+) -> tuple[float, ...] | None:
+    """Values at a time among keys (frame, values), held outside; None without keys."""
     if not keys:
         return None
-    t = np.array([frame for frame, _ in keys], float)
-    values = np.array([value for _, value in keys], float)
-    if len(t) == 1:
-        return values[0]
-    now = float(np.clip(time, t[0], t[-1]))
+    t = [frame for frame, _ in keys]
+    now = min(max(float(time), t[0]), t[-1])
+    k = max(1, bisect.bisect_left(t, now))
+    if k == len(t):  # one key alone
+        return tuple(keys[0][1])
+    span = t[k] - t[k - 1]
+    u = (now - t[k - 1]) / span
+    a, b = keys[k - 1][1], keys[k][1]
     if interpolation == "linear":
-        return np.array([np.interp(now, t, column) for column in values.T])
-    from scipy.interpolate import CubicHermiteSpline
+        return tuple((1 - u) * p + u * q for p, q in zip(a, b, strict=True))
 
-    slopes = np.empty_like(values)
-    slopes[1:-1] = (values[2:] - values[:-2]) / (t[2:] - t[:-2])[:, None]
-    slopes[0] = (values[1] - values[0]) / (t[1] - t[0])
-    slopes[-1] = (values[-1] - values[-2]) / (t[-1] - t[-2])
-    return np.asarray(CubicHermiteSpline(t, values, slopes)(now), float)
+    def slopes(i: int) -> list[float]:
+        low, high = max(i - 1, 0), min(i + 1, len(keys) - 1)
+        ends = zip(keys[low][1], keys[high][1], strict=True)
+        return [(q - p) / (t[high] - t[low]) for p, q in ends]
+
+    rise = u * u * (3 - 2 * u)
+    leave, arrive = span * u * (1 - u) ** 2, span * u * u * (u - 1)
+    return tuple(
+        (1 - rise) * p + rise * q + leave * m + arrive * n
+        for p, q, m, n in zip(a, b, slopes(k - 1), slopes(k), strict=True)
+    )
 
 
 def _turn(keys: Sequence[tuple[float, Vector]], time: int | float) -> Vector | None:
     """Degrees about x, y, z in turn at a time among keys; None without keys."""
     if not keys:
         return None
-    t = np.array([frame for frame, _ in keys], float)
-    near = np.flatnonzero(t == np.clip(time, t[0], t[-1]))
-    if near.size:  # a key's own angles, not others that mean the same
-        return keys[int(near[0])][1]
+    t = [frame for frame, _ in keys]
+    now = min(max(float(time), t[0]), t[-1])
+    if now in t:  # a key's own angles, not others that mean the same
+        return keys[t.index(now)][1]
     from scipy.spatial.transform import Rotation, Slerp
 
-    turns = Rotation.from_euler("xyz", np.array([angles for _, angles in keys]), degrees=True)
-    angles = Slerp(t, turns)(time).as_euler("xyz", degrees=True, suppress_warnings=True)
-    return _vector(angles, (0.0, 0.0, 0.0))
+    turns = Rotation.from_euler("xyz", [angles for _, angles in keys], degrees=True)
+    angles = Slerp(t, turns)(now).as_euler("xyz", degrees=True, suppress_warnings=True)
+    return _vector(angles.tolist(), (0.0, 0.0, 0.0))
 
 
-def _sides(scale: float | tuple[float, float, float]) -> tuple[float, float, float]:
-    return scale if isinstance(scale, tuple) else (scale, scale, scale)
+def _logarithms(scale: float | Vector) -> Vector:
+    x, y, z = scale if isinstance(scale, tuple) else (scale, scale, scale)
+    return math.log(x), math.log(y), math.log(z)
 
 
-def _vector(values: NDArray[np.float64] | None, otherwise: Vector) -> Vector:
+def _exponentials(values: Sequence[float]) -> Vector:
+    x, y, z = values
+    return math.exp(x), math.exp(y), math.exp(z)
+
+
+def _vector(values: Sequence[float] | None, otherwise: Vector) -> Vector:
     if values is None:
         return otherwise
-    x, y, z = (float(v) for v in values)
+    x, y, z = values
     return x, y, z

@@ -219,6 +219,36 @@ def test_what_is_not_needed_is_skipped_with_its_reason(
     assert skipped.outputs == skipped.command == skipped.inputs == ()
 
 
+def test_a_sequence_has_a_stage_for_each_frame_that_depends_on_its_own_pose(
+    root: Path,
+) -> None:
+    keys = "key = [{ frame = 1, position = [0, 0, 0] }, { frame = 3, position = [0, 0, 1] }]"
+    text = changed('mesh = "sphere"', f'mesh = "sphere"\n{keys}')
+    with pytest.raises(UserError, match="view 'main' is a sequence: say which"):
+        planned(text, root)
+    text = changed('name = "main"', 'name = "main"\nframes = "1-3"', text)
+    text = changed('model = "equisolid"\n', 'model = "equisolid"\nframes = "2"\n', text)
+    plan = planned(text, root)
+    frames = {name for name in plan if name.startswith("render ")}
+    assert frames == {"render main 0001", "render main 0002", "render main 0003"} | {
+        "render wide 0002"
+    }
+    stage = plan["render main 0002"]
+    assert stage.outputs == ("build/main.0002.exr", "build/main.0002.png")
+    assert " ".join(stage.command) == (
+        "chromeball render scene.toml --view main -o build/main.%04d.exr --frames 2 --force"
+    )
+    assert {"build/plate.exr", "build/main.cameramodel"} < set(stage.inputs)
+    assert set(stage.outputs) < set(plan["report"].inputs)
+    # the last key moves the frames between the last two, and no other
+    more = changed("1] }]", "1] }, { frame = 4, position = [0, 0, 9] }]", text)
+    again = planned(more, root)
+    assert all(again[name].slice_text() == plan[name].slice_text() for name in frames)
+    moved = planned(changed("[0, 0, 1]", "[0, 0, 2]", text), root)
+    differ = {name for name in frames if moved[name].slice_text() != plan[name].slice_text()}
+    assert differ == frames - {"render main 0001"}
+
+
 def test_no_object_means_nothing_to_render_and_no_camera(root: Path) -> None:
     start, end = FULL.index("[[object]]"), FULL.index("[[view]]")
     plan = planned(FULL[:start] + FULL[end:], root)
