@@ -204,7 +204,7 @@ class Compositor:
         if height < 1 or width < 1:
             raise UserError(f"a picture of {height} x {width} has no pixels")
         if plate is None:
-            plate = self._core.background(self._rays, self._camera, self._plate_samples)
+            plate = self.background(rays, camera, self._plate_samples)
         self.plate = np.ascontiguousarray(plate, np.float32)
         if self.plate.shape != (height, width, 3):
             raise ValueError(f"plate is {self.plate.shape}, rays are for {height} x {width}")
@@ -212,6 +212,13 @@ class Compositor:
         #: pixels inside the lens; the core leaves the others out
         self._seen = corners[1:, 1:] & corners[1:, :-1] & corners[:-1, 1:] & corners[:-1, :-1]
         self.restart()
+
+    def background(
+        self, rays: NDArray[np.float32], camera: Values, samples: int
+    ) -> NDArray[np.float32]:
+        """The captured set alone, (H, W, 3), seen by a camera with `samples` a pixel."""
+        rays = np.ascontiguousarray(rays, np.float32)
+        return self._core.background(rays, _triple(camera), samples)
 
     def place(
         self,

@@ -27,7 +27,7 @@ from chromeball.scene.image import read_image, read_rgb, to_display, write_exr, 
 from chromeball.scene.manifest import Look, Scene, View
 from chromeball.scene.pose import Pose
 from chromeball.scene.record import Stage, check_output
-from chromeball.stand_in.ply import read_stand_in
+from chromeball.stand_in.ply import StandInMesh, read_stand_in
 
 #: Told after each pass: samples a pixel and, where it is known, the relative error so far.
 type Progress = Callable[[int, float | None], None]
@@ -86,62 +86,32 @@ def prepare(scene: Scene, folder: Path, view: View, spp: int) -> Job:
         When an input is missing or broken, or plate and camera differ in size.
 
     """
-    build = folder / scene.folder
-    inputs: list[Path] = []
-    environment, origin = None, np.zeros(3)
-    if scene.render.integrator != "ao":
-        env_file = build / "env.exr"
-        environment = read_rgb(env_file)
-        if environment.shape[1] != 2 * environment.shape[0]:
-            raise UserError("a lat-long map is twice as wide as high", file=env_file)
-        origin = _origin(env_file)
-        inputs.append(env_file)
-    stand_in = None
-    if scene.stand_in:
-        inputs.append(build / "stand_in.ply")
-        stand_in = read_stand_in(inputs[-1])
-    plate = plate_file = None
-    if view.bracket or view.plate:
-        plate_file = build / f"{view.bracket}.exr" if view.bracket else folder / str(view.plate)
-        # posed by four points, or a file that holds the pose
-        camera_file = build / f"{view.name}.cameramodel"
-        if view.camera and not view.points:
-            camera_file = folder / view.camera
-        inputs += [plate_file, camera_file]
-        plate = read_rgb(plate_file)
-        camera = CameraModel.read(camera_file)
-        if camera.size != (plate.shape[1], plate.shape[0]):
+    if scene.render.integrator == "ao":
+        if not (view.bracket or view.plate):
             raise UserError(
-                f"the camera is for {camera.size[0]} x {camera.size[1]} pixels, the plate has "
-                f"{plate.shape[1]} x {plate.shape[0]}",
-                file=camera_file,
+                f"view {view.name!r}: ambient occlusion has no light to show: give it a plate"
             )
-    elif environment is None:
-        raise UserError(
-            f"view {view.name!r}: ambient occlusion has no light to show: give it a plate"
-        )
+        back = backdrop(scene, folder, view, np.zeros(3))
+        stand_in, inputs = _stand_in(scene, folder)
+        captured = even_light(stand_in, back.camera.world_from_camera.translation)
     else:
-        camera = virtual_camera(view, origin)
+        captured, inputs = captured_set(scene, folder)
+        back = backdrop(scene, folder, view, captured.origin)
     if scene.light and scene.render.integrator != "path":
         raise UserError(
             f"the {scene.render.integrator} integrator knows no lights: --integrator path does"
         )
+    inputs += back.inputs
     inputs += [path for path in scene_inputs(scene, folder) if path.is_file()]
-    place = camera.world_from_camera.translation
-    captured = (
-        even_light(stand_in, place)
-        if environment is None
-        else CapturedSet(environment, origin, stand_in)
-    )
     compositor = Compositor(
         [
             *(thing for things in object_instances(scene, folder) for thing in things),
             *area_lights(scene, folder),
         ],
         captured,
-        corner_rays(camera),
-        place,
-        plate,
+        corner_rays(back.camera),
+        back.camera.world_from_camera.translation,
+        back.plate,
         integrator=scene.render.integrator,
         bounces=scene.render.bounces,
         mode=scene.render.composite,
@@ -149,6 +119,7 @@ def prepare(scene: Scene, folder: Path, view: View, spp: int) -> Job:
         samples=spp,
         lights=delta_lights(scene),
     )
+    camera, plate_file = back.camera, back.inputs[0] if back.inputs else None
     look, read = read_look(view.look, scene, folder, plate_file, compositor.plate, camera)
     inputs += read
     return Job(
@@ -161,6 +132,54 @@ def prepare(scene: Scene, folder: Path, view: View, spp: int) -> Job:
         look,
         scene.render.denoise,
     )
+
+
+def captured_set(scene: Scene, folder: Path) -> tuple[CapturedSet, list[Path]]:
+    """Light and geometry that the scene's stages have made, and the files they are in."""
+    env_file = folder / scene.folder / "env.exr"
+    environment = read_rgb(env_file)
+    if environment.shape[1] != 2 * environment.shape[0]:
+        raise UserError("a lat-long map is twice as wide as high", file=env_file)
+    stand_in, inputs = _stand_in(scene, folder)
+    captured = CapturedSet(environment, _origin(env_file), stand_in)
+    return captured, [env_file, *inputs]
+
+
+def _stand_in(scene: Scene, folder: Path) -> tuple[StandInMesh | None, list[Path]]:
+    if not scene.stand_in:
+        return None, []
+    file = folder / scene.folder / "stand_in.ply"
+    return read_stand_in(file), [file]
+
+
+@dataclass(frozen=True)
+class Backdrop:
+    """A view's camera, its photograph (H, W, 3) if it has one, the files they came from."""
+
+    camera: CameraModel
+    plate: NDArray[np.float32] | None = None
+    inputs: tuple[Path, ...] = ()
+
+
+def backdrop(scene: Scene, folder: Path, view: View, origin: NDArray[np.float64]) -> Backdrop:
+    """What a view sees before anything is put into it; `origin` (3,) is the probe's place."""
+    if not (view.bracket or view.plate):
+        return Backdrop(virtual_camera(view, origin))
+    build = folder / scene.folder
+    plate_file = build / f"{view.bracket}.exr" if view.bracket else folder / str(view.plate)
+    # posed by four points, or a file that holds the pose
+    camera_file = build / f"{view.name}.cameramodel"
+    if view.camera and not view.points:
+        camera_file = folder / view.camera
+    plate = read_rgb(plate_file)
+    camera = CameraModel.read(camera_file)
+    if camera.size != (plate.shape[1], plate.shape[0]):
+        raise UserError(
+            f"the camera is for {camera.size[0]} x {camera.size[1]} pixels, the plate has "
+            f"{plate.shape[1]} x {plate.shape[0]}",
+            file=camera_file,
+        )
+    return Backdrop(camera, plate, (plate_file, camera_file))
 
 
 def virtual_camera(view: View, origin: NDArray[np.float64]) -> CameraModel:

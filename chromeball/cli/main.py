@@ -27,6 +27,7 @@ COMMANDS = {
     "demo": ("chromeball.cli.new:demo", "Photograph the virtual set and run every stage."),
     "plan": ("chromeball.cli.plan:plan", "What a scene needs, what is up to date, and why."),
     "render": ("chromeball.cli.render:render", "Synthetic objects into a photograph."),
+    "view": ("chromeball.cli.view:view", "A scene in the browser, to move and to change."),
     "report": ("chromeball.cli.report:report", "One HTML file on what was done, and how well."),
     "bench": ("chromeball.cli.bench:bench", "Run time against error, beside the peers."),
 }
