@@ -88,10 +88,6 @@ def _edit_material(table: Any, value: msgspec.Struct, before: msgspec.Struct) ->
             table["material"][name] = _plain(new)
 
 
-def _fields(entry: Object) -> list[Any]:
-    return [getattr(entry, name) for name in FIELDS]
-
-
 def _plain(value: Any) -> Any:
     """A value that TOML has."""
     return [*value] if isinstance(value, tuple) else value

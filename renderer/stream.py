@@ -192,6 +192,11 @@ class Session:
         """As they are now."""
         return self._settings
 
+    def eyes(self) -> tuple[Eye, ...]:
+        """Who looks."""
+        with self._wake:
+            return tuple(self._eyes)
+
     def open(
         self, show: Callable[[Picture], None], size: tuple[int, int], view: str | None = None
     ) -> Eye:

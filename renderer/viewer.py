@@ -5,6 +5,8 @@ viser's own three-dimensional scene holds nothing but gizmos; the picture is its
 
 from __future__ import annotations
 
+import contextlib
+import io
 import ipaddress
 import math
 import socket
@@ -53,7 +55,11 @@ class Viewer:
                 ) from error
             port = probe.getsockname()[1]
         self.session = session
-        self._server = viser.ViserServer(host, port, label=session.scene.name, verbose=False)
+        # the command says where, in one line
+        with contextlib.redirect_stdout(io.StringIO()):
+            self._server = viser.ViserServer(
+                host, port, label=session.scene.name, verbose=False
+            )
         self.url = f"http://{host}:{self._server.get_port()}"
         scene = self._server.scene
         scene.set_up_direction("+y")
@@ -61,8 +67,13 @@ class Viewer:
         scene.world_axes.visible = False
         # viser's own sharing would send the page through a server of theirs
         self._server.gui.configure_theme(show_share_button=False)
-        self._tabs: dict[int, _Tab] = {}
-        self._objects = [_ObjectPanel(self, entry) for entry in session.scene.object]
+        self._tabs: dict[int, Tab] = {}
+        #: a panel for each object that is not keyed
+        self.panels = [
+            _ObjectPanel(self, entry)
+            for entry in session.scene.object
+            if entry.name not in session.keyed
+        ]
         self._quality_panel()
         self._save_panel()
         self._server.on_client_connect(self._connect)
@@ -72,9 +83,13 @@ class Viewer:
         """Let all browsers go."""
         self._server.stop()
 
+    def tabs(self) -> list[Tab]:
+        """The browser tabs that look."""
+        return list(self._tabs.values())
+
     def tell(self, error: UserError) -> None:
         """Show a mistake in all tabs."""
-        for tab in list(self._tabs.values()):
+        for tab in self.tabs():
             tab.client.add_notification("Not possible", str(error), color="red")
 
     @property
@@ -90,7 +105,7 @@ class Viewer:
     # ---- tabs
 
     async def _connect(self, client: viser.ClientHandle) -> None:
-        self._tabs[client.client_id] = _Tab(client, self.session)
+        self._tabs[client.client_id] = Tab(client, self.session)
 
     async def _disconnect(self, client: viser.ClientHandle) -> None:
         tab = self._tabs.pop(client.client_id, None)
@@ -121,7 +136,7 @@ class Viewer:
         gui = self.gui
         with gui.add_folder("Save", expand_by_default=False):
             name = gui.add_text("file", self.session.file.name)
-            sure = gui.add_checkbox("overwrite", False)
+            sure: Any = gui.add_checkbox("overwrite", False)
             button = gui.add_button("save")
             said = gui.add_markdown("Poses and materials, into a scene file beside this one.")
 
@@ -137,11 +152,13 @@ class Viewer:
         button.on_click(save)
 
 
-class _Tab:
+class Tab:
     """One browser tab: its camera, its picture, its choice of view."""
 
     def __init__(self, client: viser.ClientHandle, session: Session) -> None:
         self.client, self.session = client, session
+        #: what is shown
+        self.picture: Picture | None = None
         self._asked: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
         first = next(iter(session.views))
         with client.gui.add_folder("View", order=-1):
@@ -191,6 +208,7 @@ class _Tab:
             handle.position = held.world_from_camera.translation
 
     def _show(self, picture: Picture) -> None:
+        self.picture = picture
         self.client.scene.set_background_image(
             picture.codes, format="jpeg", jpeg_quality=80 if picture.moving else 95
         )
@@ -208,17 +226,13 @@ class _ObjectPanel:
 
     def __init__(self, viewer: Viewer, entry: Object) -> None:
         self.viewer, self.session, self.name = viewer, viewer.session, entry.name
-        keyed = entry.name in self.session.keyed
         gui = viewer.gui
         with gui.add_folder(entry.name, expand_by_default=len(self.session.scene.object) < 3):
-            if keyed:
-                gui.add_markdown("Moved by its keys: change them in the scene file.")
-                return
             self.handle = gui.add_checkbox("gizmo", True)
-            self.position = gui.add_vector3("position (m)", entry.position, step=0.001)
-            self.rotation = gui.add_vector3("rotation (deg)", entry.rotation, step=0.1)
-            self.scale = gui.add_vector3("scale", _sides(entry), step=0.001)
-            self.size = gui.add_number("scale by", 1.0, min=0.01, max=100.0, step=0.01)
+            self.position: Any = gui.add_vector3("position (m)", entry.position, step=0.001)
+            self.rotation: Any = gui.add_vector3("rotation (deg)", entry.rotation, step=0.1)
+            self.scale: Any = gui.add_vector3("scale", _sides(entry), step=0.001)
+            self.size: Any = gui.add_number("scale by", 1.0, min=0.01, max=100.0, step=0.01)
             _material_controls(gui, entry.material, self._material)
         self.gizmo = viewer.gizmos.add_transform_controls(
             f"/objects/{entry.name}",
@@ -330,7 +344,7 @@ def _control(
 def _bound(kind: Any) -> tuple[float | None, float | None]:
     low = kind.ge if kind.ge is not None else kind.gt
     high = kind.le if kind.le is not None else kind.lt
-    return low, high
+    return (None if low is None else float(low)), (None if high is None else float(high))
 
 
 def _display(color: tuple[float, ...]) -> tuple[int, int, int]:

@@ -63,8 +63,8 @@ def view(
     session = Session(scene_file, travel=travel, radius=radius, frame=frame, settings=settings)
     try:
         viewer = Viewer(session, host, port)
-        print(f"{viewer.url} shows {scene_file}; Ctrl-C ends it", flush=True)
         try:
+            print(f"{viewer.url} shows {scene_file}; Ctrl-C ends it", flush=True)
             session.wait()
         except KeyboardInterrupt:
             print()

@@ -181,8 +181,7 @@ def test_cameras_stay_where_something_was_captured(scene: Path) -> None:
         np.testing.assert_allclose(held.world_from_camera.translation, session.within(far))
     finally:
         session.stop()
-    for options in ({"travel": True}, {"radius": 100.0}):
-        session = Session(scene, **options)
+    for session in (Session(scene, travel=True), Session(scene, radius=100.0)):
         try:
             np.testing.assert_array_equal(session.within(far), far)
         finally:
