@@ -33,6 +33,8 @@ from chromeball.scene.manifest import Object, Scene, read_scene
 from chromeball.scene.pose import Pose
 from chromeball.scene.sequence import at, frames_of, moves
 
+type Light = Literal["path", "direct"]
+
 #: Seconds without a change until the whole picture is begun.
 REST = 0.2
 #: Samples a pixel after which an error that is out of reach is given up.
@@ -50,7 +52,7 @@ class Settings:
     ``integrator``: of the picture at rest; in motion it is always ``direct``, the fast one.
     """
 
-    integrator: Literal["path", "direct"] = "path"
+    integrator: Light = "path"
     stops: float = 0.0
     error: float = 0.01
     fps: float = 15.0
@@ -437,7 +439,7 @@ class Session:
         low = self._error is not None and self._error <= settings.error
         return (compositor.samples >= _PILOT and low) or compositor.samples >= MOST_SAMPLES
 
-    def _ready(self, integrator: Literal["path", "direct"], objects: list[Object]) -> Compositor:
+    def _ready(self, integrator: Light, objects: list[Object]) -> Compositor:
         """The integrator's compositor, its world brought to `objects` by the cheapest way."""
         for k, (now, then) in enumerate(zip(objects, self._meshed, strict=True)):
             if not _differ_in_pose_alone(now, then):
@@ -458,7 +460,7 @@ class Session:
         self._compositors[integrator] = compositor, objects
         return compositor
 
-    def _build(self, integrator: Literal["path", "direct"], objects: list[Object]) -> Compositor:
+    def _build(self, integrator: Light, objects: list[Object]) -> Compositor:
         render = self._scene.render
         return Compositor(
             _instances(self._meshes, objects),

@@ -54,13 +54,13 @@ def view(
             f"the viewer needs {missing.name}, which is not installed: "
             "pip install 'chromeball[viewer]'"
         ) from missing
-    from chromeball.renderer.stream import Session, Settings
+    from chromeball.renderer.stream import Session
 
     if not (error > 0 and fps > 0):
         raise UserError("--error and --fps must be positive")
     check_loopback(host)
-    settings = Settings(error=error, fps=fps)
-    session = Session(scene_file, travel=travel, radius=radius, frame=frame, settings=settings)
+    session = Session(scene_file, travel=travel, radius=radius, frame=frame)
+    session.set(error=error, fps=fps)
     try:
         viewer = Viewer(session, host, port)
         try:
