@@ -172,7 +172,7 @@ class Session:
         self._eyes: list[Eye] = []
         self._version = 0
         self._wake = threading.Condition()
-        self._stopping = False
+        self._stopping = self._showing = False
         self._clock = clock
         #: the eye that the compositor's samples belong to, and the error of its picture
         self._current: Eye | None = None
@@ -230,8 +230,9 @@ class Session:
         pose = camera.world_from_camera
         held = camera.posed(Pose(pose.rotation, self.within(pose.translation)))
         with self._wake:
-            eye.camera, eye.plate, eye.view = held, None, None
-            self._touch(eye)
+            if eye.view is not None or held.text() != eye.camera.text():
+                eye.camera, eye.plate, eye.view = held, None, None
+                self._touch(eye)
         return held
 
     def resize(self, eye: Eye, size: tuple[int, int]) -> None:
@@ -339,7 +340,8 @@ class Session:
     def is_idle(self) -> bool:
         """Whether nothing is left to do for any eye."""
         with self._wake:
-            return all(eye.done and self._is_shown(eye) for eye in self._eyes)
+            shown = all(eye.done and self._is_shown(eye) for eye in self._eyes)
+            return shown and not self._showing
 
     # ---- the worker
 
@@ -368,8 +370,11 @@ class Session:
         with self._wake:
             eye.shown, eye.done = state, picture.done
             open_still = eye in self._eyes
+            self._showing = True
         if open_still:
             eye.show(picture)
+        with self._wake:
+            self._showing = False
         return True
 
     def _next(self) -> tuple[Eye | None, float | None]:

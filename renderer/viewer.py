@@ -10,6 +10,7 @@ import io
 import ipaddress
 import math
 import socket
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,9 @@ from chromeball.scene.manifest import Object
 from chromeball.scene.pose import Pose
 
 #: What the browser's camera may differ from a view's and still be it.
-_SAME = 1e-4
+_SAME = 1e-3
+#: Seconds that a browser may take to go where it is sent.
+_PATIENCE = 3.0
 #: Longest side that is rendered, in pixels; larger windows show it enlarged.
 _MOST_PIXELS = 1280
 
@@ -159,7 +162,9 @@ class Tab:
         self.client, self.session = client, session
         #: what is shown
         self.picture: Picture | None = None
-        self._asked: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
+        #: the pose of the view that is looked through, until the camera is dragged away
+        self._own: Pose | None = None
+        self._patience = 0.0
         first = next(iter(session.views))
         with client.gui.add_folder("View", order=-1):
             self.views = client.gui.add_dropdown(
@@ -179,7 +184,8 @@ class Tab:
     def _go(self, camera: CameraModel) -> None:
         """Put the browser's camera where the view's is."""
         handle, pose = self.client.camera, camera.world_from_camera
-        self._asked = (pose.translation, pose.rotation[:, 2])
+        self._own = pose
+        self._patience = time.monotonic() + _PATIENCE
         with self.client.atomic():
             handle.up_direction = -pose.rotation[:, 1]
             handle.position = pose.translation
@@ -187,25 +193,25 @@ class Tab:
             handle.fov = _vertical_angle(camera, handle.aspect)
 
     async def _moved(self, handle: viser.CameraHandle) -> None:
-        self.session.resize(self.eye, _window(handle))
-        place, towards = (
-            handle.position,
-            Rotation.from_quat(handle.wxyz, scalar_first=True).as_matrix(),
-        )
-        if self._asked is not None:
-            moved = np.linalg.norm(place - self._asked[0])
-            turned = np.linalg.norm(towards[:, 2] - self._asked[1])
-            distance = float(np.linalg.norm(handle.look_at - place))
-            if moved <= _SAME * distance and turned <= 10 * _SAME:
-                return  # the view's own camera, still
-        self._asked = None
         size = _window(handle)
+        self.session.resize(self.eye, size)
+        turned = Rotation.from_quat(handle.wxyz, scalar_first=True).as_matrix()
+        place = np.array(handle.position, float)
+        if self._own is not None:
+            reach = float(np.linalg.norm(handle.look_at - place))
+            moved = np.linalg.norm(place - self._own.translation) > _SAME * reach
+            if not moved and np.linalg.norm(turned[:, 2] - self._own.rotation[:, 2]) <= _SAME:
+                self._patience = 0.0  # it has arrived
+                return
+            if time.monotonic() < self._patience:
+                return  # where it was before it was sent there
+        self._own = None
         fov = 2 * math.atan(math.tan(handle.fov / 2) * size[0] / size[1])
-        pose = Pose(towards, np.array(place, float))
-        held = self.session.look(self.eye, CameraModel.pinhole(size, fov, pose))
-        excess = place - held.world_from_camera.translation
-        if np.linalg.norm(excess) > _SAME * self.session.radius:
-            handle.position = held.world_from_camera.translation
+        held = self.session.look(
+            self.eye, CameraModel.pinhole(size, fov, Pose(turned, place))
+        ).world_from_camera.translation
+        if np.linalg.norm(place - held) > _SAME * self.session.radius:
+            handle.position = held
 
     def _show(self, picture: Picture) -> None:
         self.picture = picture
