@@ -13,7 +13,7 @@ from typing import Any
 import msgspec
 
 from chromeball.scene.errors import UserError
-from chromeball.scene.manifest import Object, parse_scene
+from chromeball.scene.manifest import Material, Object, parse_scene
 from chromeball.scene.record import write_text
 
 #: What an interactive session changes of an object.
@@ -74,16 +74,20 @@ def save(source: Path, target: Path, objects: Sequence[Object], *, overwrite: bo
     write_text(target, edited(text, objects, source))
 
 
-def _edit_material(table: Any, value: msgspec.Struct, before: msgspec.Struct) -> None:
+def _edit_material(table: Any, value: Material | None, before: Material | None) -> None:
     import tomlkit
 
+    if value is None:
+        table.pop("material")
+        return
     if "material" not in table:
         table["material"] = tomlkit.inline_table()
+    old = {} if before is None else msgspec.structs.asdict(before)
     for name, new in msgspec.structs.asdict(value).items():
-        if new == getattr(before, name):
+        if before is not None and new == old[name]:
             continue
         if new is None:
-            table["material"].pop(name)
+            table["material"].pop(name, None)
         else:
             table["material"][name] = _plain(new)
 

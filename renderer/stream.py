@@ -15,17 +15,24 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from chromeball.renderer.composite import CapturedSet, Compositor
-from chromeball.renderer.mesh import Instance, Mesh
+from chromeball.renderer.lights import area_lights, delta_lights
+from chromeball.renderer.mesh import Instance, Mesh, affine
 from chromeball.renderer.path import corner_rays
 from chromeball.renderer.render import automatic_exposure, backdrop, captured_set
-from chromeball.renderer.scene import object_mesh, pose_of
+from chromeball.renderer.scene import (
+    baked,
+    instances_of,
+    object_instances,
+    pose_of,
+    to_material,
+)
 from chromeball.scene.camera import CameraModel
 from chromeball.scene.errors import UserError
 from chromeball.scene.image import to_display
@@ -34,6 +41,9 @@ from chromeball.scene.pose import Pose
 from chromeball.scene.sequence import at, frames_of, moves
 
 type Light = Literal["path", "direct"]
+_LIGHT: tuple[Light, ...] = get_args(Light.__value__)
+#: An object's keys where it is neither scaled, nor turned, nor moved.
+_HOME: dict[str, Any] = {"position": (0.0,) * 3, "rotation": (0.0,) * 3, "scale": 1.0}
 
 #: Seconds without a change until the whole picture is begun.
 REST = 0.2
@@ -164,10 +174,16 @@ class Session:
         ]
         self.radius = math.inf if travel else _radius(self.captured, radius)
         self.exposure = self._steady_exposure()
-        self._meshes = [_local_mesh(o, self.folder) for o in self._scene.object]
-        self._meshed = self._scene.object
+        home = [msgspec.structs.replace(o, **_HOME) for o in self._scene.object]
+        at_home = msgspec.structs.replace(self._scene, object=home)
+        #: of each object its parts before it is scaled, turned and moved
+        self._parts = object_instances(at_home, self.folder)
+        self._materials = [o.material for o in self._scene.object]
+        self._lamps = area_lights(self._scene, self.folder)
         #: a compositor for each integrator that was asked for, with the objects it has
         self._compositors: dict[str, tuple[Compositor, list[Object]]] = {}
+        #: the integrators that can be had, the fastest last: direct knows no lights
+        self.integrators: tuple[Light, ...] = ("path",) if self._scene.light else _LIGHT
         self._settings = settings or Settings(integrator=self._scene.render.integrator)
         self._eyes: list[Eye] = []
         self._version = 0
@@ -269,6 +285,8 @@ class Session:
                 new = msgspec.convert(value, Object, strict=False)
             except msgspec.ValidationError as error:
                 raise UserError(f"{name}: {error}") from error
+            if new.material is not None and new.material != old.material:
+                to_material(new.material, self.folder)  # its images are there and whole
             if new != old:
                 objects = [*self._scene.object]
                 objects[k] = new
@@ -281,7 +299,10 @@ class Session:
         """Change :class:`Settings`; only another integrator begins the picture again."""
         with self._wake:
             before = self._settings
-            self._settings = replace(before, **fields)
+            after = replace(before, **fields)
+            if after.integrator not in self.integrators:
+                raise UserError("the direct integrator knows no lights: the scene has some")
+            self._settings = after
             for eye in self._eyes:
                 eye.done = False
             if before.integrator != self._settings.integrator:
@@ -320,8 +341,8 @@ class Session:
     def size_of(self, name: str) -> float:
         """Half the diagonal of an object's bounding box, in metres, as it is now."""
         k = self._index(name)
-        vertices = self._meshes[k].vertices
-        sides = np.ptp(vertices, axis=0) * np.asarray(self._scene.object[k].scale)
+        corners = np.concatenate([baked(part).vertices for part in self._parts[k]])
+        sides = np.ptp(corners, axis=0) * np.asarray(self._scene.object[k].scale)
         return float(np.linalg.norm(sides)) / 2
 
     def stop(self) -> None:
@@ -404,7 +425,8 @@ class Session:
         settings: Settings,
     ) -> Picture:
         start = self._clock()
-        compositor = self._ready("direct" if moving else settings.integrator, objects)
+        integrator = self.integrators[-1] if moving else settings.integrator
+        compositor = self._ready(integrator, objects)
         if fresh:
             fit = min(1.0, size[0] / camera.size[0], size[1] / camera.size[1])
             small = _scaled(camera, fit * (eye.pace.scale if moving else 1.0))
@@ -446,29 +468,30 @@ class Session:
 
     def _ready(self, integrator: Light, objects: list[Object]) -> Compositor:
         """The integrator's compositor, its world brought to `objects` by the cheapest way."""
-        for k, (now, then) in enumerate(zip(objects, self._meshed, strict=True)):
-            if not _differ_in_pose_alone(now, then):
-                self._meshes[k] = _local_mesh(now, self.folder)
-        self._meshed = objects
+        for k, entry in enumerate(objects):
+            if entry.material != self._materials[k]:
+                self._parts[k] = self._made_of(entry, self._parts[k])
+                self._materials[k] = entry.material
         if integrator not in self._compositors:
-            compositor = self._build(integrator, objects)
-            self._compositors[integrator] = compositor, objects
-            return compositor
+            self._compositors[integrator] = self._build(integrator, objects), objects
         compositor, built = self._compositors[integrator]
         pairs = list(zip(objects, built, strict=True))
-        if all(_differ_in_pose_alone(now, then) for now, then in pairs):
-            for k, (now, then) in enumerate(pairs):
+        if all(_can_be_moved(now, then) for now, then in pairs):
+            first = 0
+            for (now, then), parts in zip(pairs, self._parts, strict=True):
                 if now != then:
-                    compositor.move(k, pose_of(now), now.scale)
+                    for k in range(first, first + len(parts)):
+                        compositor.move(k, pose_of(now), now.scale)
+                first += len(parts)
         else:
-            compositor.place(_instances(self._meshes, objects))
+            compositor.place(self._instances(objects))
         self._compositors[integrator] = compositor, objects
         return compositor
 
     def _build(self, integrator: Light, objects: list[Object]) -> Compositor:
         render = self._scene.render
         return Compositor(
-            _instances(self._meshes, objects),
+            self._instances(objects),
             self.captured,
             corner_rays(CameraModel.pinhole((1, 1), 1.0)),
             self.captured.origin,
@@ -478,7 +501,33 @@ class Session:
             seed=render.seed,
             samples=256,
             integrator=integrator,
+            lights=delta_lights(self._scene),
         )
+
+    def _instances(self, objects: list[Object]) -> list[Instance]:
+        found: list[Instance] = []
+        for entry, parts in zip(objects, self._parts, strict=True):
+            if entry.instances:  # each copy has a pose of its own, after the object's
+                own = np.vstack([affine(pose_of(entry), entry.scale), [0, 0, 0, 1]])
+                inner = [np.eye(4) if part.inner is None else part.inner for part in parts]
+                found += [
+                    replace(part, inner=own @ i) for part, i in zip(parts, inner, strict=True)
+                ]
+            else:
+                found += [replace(p, pose=pose_of(entry), scale=entry.scale) for p in parts]
+        return [*found, *self._lamps]
+
+    def _made_of(self, entry: Object, parts: list[Instance]) -> list[Instance]:
+        """The parts of an object in its new material; shared triangles stay shared."""
+        if entry.material is None:  # the file's own
+            return instances_of(msgspec.structs.replace(entry, **_HOME), self.folder)
+        material = to_material(entry.material, self.folder)
+        known: dict[int, Mesh] = {}
+        for part in parts:
+            mesh = part.mesh
+            index = np.zeros(len(mesh.faces), np.uint16)
+            known.setdefault(id(mesh), replace(mesh, material=index, materials=(material,)))
+        return [replace(part, mesh=known[id(part.mesh)]) for part in parts]
 
     # ---- small things
 
@@ -561,19 +610,10 @@ def nearest_distance(point: NDArray[np.float64], triangles: NDArray[np.float64])
     return float(np.where(inside, np.minimum(distances, np.abs(height)), distances).min())
 
 
-def _local_mesh(entry: Object, folder: Path) -> Mesh:
-    """The object's triangles before it is scaled, turned and moved."""
-    fields = {"position": (0.0, 0.0, 0.0), "rotation": (0.0, 0.0, 0.0), "scale": 1.0}
-    return object_mesh(msgspec.structs.replace(entry, **fields), folder)
-
-
-def _instances(meshes: list[Mesh], objects: list[Object]) -> list[Instance]:
-    return [Instance(m, pose_of(o), o.scale) for m, o in zip(meshes, objects, strict=True)]
-
-
-def _differ_in_pose_alone(now: Object, then: Object) -> bool:
+def _can_be_moved(now: Object, then: Object) -> bool:
+    """Whether objects are alike but for a pose that no copies hang on."""
     pose = {"position": then.position, "rotation": then.rotation, "scale": then.scale}
-    return msgspec.structs.replace(now, **pose) == then
+    return now == then or (not now.instances and msgspec.structs.replace(now, **pose) == then)
 
 
 def _scaled(camera: CameraModel, factor: float) -> CameraModel:

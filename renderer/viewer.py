@@ -13,7 +13,7 @@ import socket
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 import msgspec
 import numpy as np
@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 from chromeball.renderer.stream import Picture, Session
 from chromeball.scene.camera import CameraModel
 from chromeball.scene.errors import UserError
-from chromeball.scene.manifest import Object
+from chromeball.scene.manifest import PRIMITIVES, Material, Object, has_key
 from chromeball.scene.pose import Pose
 
 #: What the browser's camera may differ from a view's and still be it.
@@ -121,7 +121,7 @@ class Viewer:
         settings, gui = self.session.settings, self.gui
         with gui.add_folder("Picture"):
             integrator = gui.add_dropdown(
-                "light at rest", ["path", "direct"], initial_value=settings.integrator
+                "light at rest", [*self.session.integrators], initial_value=settings.integrator
             )
             stops = gui.add_slider("exposure (stops)", -8.0, 8.0, 0.1, settings.stops)
             samples = gui.add_slider("samples while moving", 1, 32, 1, settings.samples)
@@ -239,7 +239,7 @@ class _ObjectPanel:
             self.rotation: Any = gui.add_vector3("rotation (deg)", entry.rotation, step=0.1)
             self.scale: Any = gui.add_vector3("scale", _sides(entry), step=0.001)
             self.size: Any = gui.add_number("scale by", 1.0, min=0.01, max=100.0, step=0.01)
-            _material_controls(gui, entry.material, self._material)
+            self.material = _MaterialPanel(gui, entry, self.change)
         self.gizmo = viewer.gizmos.add_transform_controls(
             f"/objects/{entry.name}",
             scale=1.2 * self.session.size_of(entry.name),
@@ -274,10 +274,6 @@ class _ObjectPanel:
             self.change(scale=_rounded(np.array(self.scale.value) * factor, 6))
             self.size.value = 1.0
 
-    def _material(self, **fields: Any) -> None:
-        now = next(o for o in self.session.scene.object if o.name == self.name)
-        self.change(material={**msgspec.to_builtins(now.material), **fields})
-
     def change(self, **fields: Any) -> None:
         try:
             entry = self.session.change(self.name, **fields)
@@ -310,47 +306,65 @@ def check_loopback(host: str) -> None:
         )
 
 
-def _material_controls(
-    gui: viser.GuiApi, material: msgspec.Struct, change: Callable[..., None]
-) -> None:
-    """A control for each key that a material of the scene file has, by its type."""
-    info: Any = msgspec.inspect.type_info(type(material))
-    for field in info.fields:
-        _control(gui, field.name, field.type, getattr(material, field.name), change)
+#: Keys of a material that have a slider: least, most, and what stands there unless given.
+_SLIDERS = {
+    "roughness": (0.0, 1.0, 1.0),
+    "metallic": (0.0, 1.0, 0.0),
+    "specular": (0.0, 1.0, 1.0),
+    "ior": (1.0, 4.0, 1.5),
+    "transmission": (0.0, 1.0, 0.0),
+    "clearcoat": (0.0, 1.0, 0.0),
+    "clearcoat_roughness": (0.0, 1.0, 0.0),
+    "alpha": (0.0, 1.0, 1.0),
+}
+_OWN = "the file's own"
 
 
-def _control(
-    gui: viser.GuiApi, name: str, kind: Any, value: Any, change: Callable[..., None]
-) -> None:
-    label = name.replace("_", " ")
-    control: Any
-    match kind:
-        case msgspec.inspect.LiteralType():
-            control = gui.add_dropdown(label, [*map(str, kind.values)], initial_value=value)
-            control.on_update(lambda _: change(**{name: control.value}))
-        case msgspec.inspect.BoolType():
-            control = gui.add_checkbox(label, value)
-            control.on_update(lambda _: change(**{name: control.value}))
-        case msgspec.inspect.TupleType() if len(kind.item_types) == 3 and _bound(
-            kind.item_types[0]
-        ) == (0.0, 1.0):
-            control = gui.add_rgb(label, _display(value))
-            control.on_update(lambda _: change(**{name: _linear(control.value)}))
-        case msgspec.inspect.FloatType():
-            low, high = _bound(kind)
-            if low is None or high is None:
-                control = gui.add_number(label, value, min=low, max=high, step=0.01)
-            else:
-                control = gui.add_slider(label, low, high, 0.01, value)
-            control.on_update(lambda _: change(**{name: float(control.value)}))
-        case _:
-            gui.add_text(label, str(value), disabled=True)
+class _MaterialPanel:
+    """What an object is made of; keys without a control stay as the scene file has them."""
 
+    def __init__(self, gui: viser.GuiApi, entry: Object, change: Callable[..., None]) -> None:
+        self._change = change
+        self._material: dict[str, Any] = msgspec.to_builtins(entry.material or Material())
+        kinds = [*get_args(get_type_hints(Material)["kind"])]
+        own = [] if entry.mesh in PRIMITIVES else [_OWN]
+        material = entry.material or Material()
+        self._kind: Any = gui.add_dropdown(
+            "material",
+            [*own, *kinds],
+            initial_value=_OWN if own and entry.material is None else material.kind,
+        )
+        self._color: Any = gui.add_rgb("color", _display(material.color or (0.5, 0.5, 0.5)))
+        self._kind.on_update(lambda _: self._edit(kind=self._kind.value))
+        self._color.on_update(lambda _: self._edit(color=_linear(self._color.value)))
+        self._sliders: dict[str, Any] = {}
+        for name, (least, most, usual) in _SLIDERS.items():
+            given = getattr(material, name)
+            value = usual if given is None else given
+            slider: Any = gui.add_slider(name.replace("_", " "), least, most, 0.01, value)
+            slider.on_update(
+                lambda _, name=name, slider=slider: self._edit(**{name: float(slider.value)})
+            )
+            self._sliders[name] = slider
+        self._reveal()
 
-def _bound(kind: Any) -> tuple[float | None, float | None]:
-    low = kind.ge if kind.ge is not None else kind.gt
-    high = kind.le if kind.le is not None else kind.lt
-    return (None if low is None else float(low)), (None if high is None else float(high))
+    def _edit(self, **fields: Any) -> None:
+        kind = self._kind.value
+        self._material |= {**fields, "kind": kind}
+        kept = {
+            key: value
+            for key, value in self._material.items()
+            if value is not None and has_key(kind, key)
+        }
+        self._change(material=None if kind == _OWN else kept)
+        self._reveal()
+
+    def _reveal(self) -> None:
+        """Show the controls that mean something to the kind."""
+        kind = self._kind.value
+        self._color.visible = kind != _OWN
+        for name, slider in self._sliders.items():
+            slider.visible = kind != _OWN and has_key(kind, name)
 
 
 def _display(color: tuple[float, ...]) -> tuple[int, int, int]:

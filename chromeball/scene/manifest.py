@@ -270,6 +270,11 @@ _MATERIAL: dict[str, tuple[str, ...]] = {
 }
 
 
+def has_key(kind: str, key: str) -> bool:
+    """Whether a kind of material has a key."""
+    return kind in _MATERIAL.get(key, (kind,))
+
+
 class Placement(Table, frozen=True):
     """One more place of an object: scaled, then rotated (degrees), then moved."""
 
