@@ -218,7 +218,8 @@ class Compositor:
     ) -> NDArray[np.float32]:
         """The captured set alone, (H, W, 3), seen by a camera with `samples` a pixel."""
         rays = np.ascontiguousarray(rays, np.float32)
-        return self._core.background(rays, _triple(camera), samples)
+        place = triple(np.subtract(camera, self._about))
+        return self._core.background(rays, place, samples)
 
     def place(
         self,
