@@ -30,15 +30,15 @@ void Compositor::place(World& objects) {
   bounds_ = Bounds(objects_->bounds());
 }
 
-void Compositor::move(uint32_t object, const double* matrix) {
-  objects_->move(object, matrix);
+void Compositor::move(uint32_t object, const double* matrices, size_t steps) {
+  objects_->move(object, matrices, steps);
   bounds_ = Bounds(objects_->bounds());
 }
 
 Hit Compositor::meet_object(Vec3 o, Vec3 d, float tfar, Vec3& share, Path& path) const {
   if (!bounds_.may_hit(o, d)) return {};
   ++path.rays;
-  Hit hit = objects_->intersect(o, d, tfar);
+  Hit hit = objects_->intersect(o, d, tfar, path.time);
   if (!objects_->transmits()) return hit;
   float before = 0;
   for (int k = 0; k < kMostPassed && hit && objects_->material(hit).transmits; ++k) {
@@ -55,7 +55,7 @@ Hit Compositor::meet_object(Vec3 o, Vec3 d, float tfar, Vec3& share, Path& path)
     before += dot(next - o, d);
     o = next;
     ++path.rays;
-    hit = objects_->intersect(o, d, tfar - before);
+    hit = objects_->intersect(o, d, tfar - before, path.time);
   }
   if (hit) hit.t += before;
   return hit;
@@ -128,7 +128,7 @@ float Compositor::lamp_density(const Surface& s, const Hit& hit, Vec3 from, Vec3
 Vec3 Compositor::direct_light(const Surface& s, Vec3 wo, int bounces, Path& path) const {
   Vec3 sum = captured_light(s, wo, bounces, path);
   if (!objects_->shines()) return sum;
-  const World::Emitter lamp = objects_->sample_emitter(path.sampler.pair());
+  const World::Emitter lamp = objects_->sample_emitter(path.sampler.pair(), path.time);
   const Vec3 n = dot(lamp.n, s.p - lamp.p) < 0 ? -lamp.n : lamp.n;
   const Vec3 x = s.start(lamp.p - s.p), to = lamp.p + lamp.rise * n - x;
   const float t2 = length2(to), t = std::sqrt(t2);
@@ -138,7 +138,7 @@ Vec3 Compositor::direct_light(const Surface& s, Vec3 wo, int bounces, Path& path
   Vec3 f = shade(s, wo, d);
   if (is_zero(f)) return sum;
   path.rays += 2;
-  f *= objects_->transmittance(x, to, 1 - kLift);
+  f *= objects_->transmittance(x, to, 1 - kLift, path.time);
   if (is_zero(f) || captured_.blocked(x, to, 1 - kLift)) return sum;
   return sum + (1 / (lamp.density * t2 / cos + density(s, wo, d))) * f * lamp.radiance;
 }
@@ -151,7 +151,7 @@ Vec3 Compositor::captured_light(const Surface& s, Vec3 wo, int bounces, Path& pa
   const Vec3 x = s.start(light.d);
   if (bounds_.may_hit(x, light.d)) {
     ++path.rays;
-    f *= objects_->transmittance(x, light.d, light.t * (1 - 1e-4f));
+    f *= objects_->transmittance(x, light.d, light.t * (1 - 1e-4f), path.time);
     if (is_zero(f)) return {};
   }
   const Place place = meet_stand_in(x, light.d, kInfinity, path);
@@ -178,7 +178,7 @@ Vec3 Compositor::delta_light(const Surface& s, Vec3 wo, Path& path) const {
     const Vec3 x = s.start(in.d);
     if (bounds_.may_hit(x, in.d)) {
       ++path.rays;
-      f *= objects_->transmittance(x, in.d, in.t);
+      f *= objects_->transmittance(x, in.d, in.t, path.time);
       if (is_zero(f)) continue;
     }
     if (!in_shadow_of_set(x, light, in, path)) sum += f;
@@ -196,7 +196,7 @@ Vec3 Compositor::delta_change(Vec3 x, Vec3 n, Path& path) const {
     Vec3 E = cos * in.irradiance;
     if (bounds_.may_hit(x, in.d)) {
       ++path.rays;
-      E *= objects_->transmittance(x, in.d, in.t);
+      E *= objects_->transmittance(x, in.d, in.t, path.time);
       if (is_zero(E)) continue;
     }
     if (!in_shadow_of_set(x, light, in, path)) dE += E;
@@ -255,7 +255,7 @@ Vec3 Compositor::cone_change(Vec3 x, Vec3 n, Vec3 d, const Cones& cones, int bou
 // to the other strategies.
 Vec3 Compositor::lamp_change(Vec3 x, Vec3 n, const Cones& cones, int bounces,
                              Path& path) const {
-  const World::Emitter lamp = objects_->sample_emitter(path.sampler.pair());
+  const World::Emitter lamp = objects_->sample_emitter(path.sampler.pair(), path.time);
   const Vec3 to = lamp.p - x, d = unit_or(to, n);
   if (dot(d, n) <= 0) return {};
   Vec3 through(1.0f);
@@ -289,8 +289,9 @@ Vec3 Compositor::relative_change(const Place& place, int bounces, bool all, Path
   return {E.x > 0 ? dE.x / E.x : 0, E.y > 0 ? dE.y / E.y : 0, E.z > 0 ? dE.z / E.z : 0};
 }
 
-uint64_t Compositor::pass(const PixelRays& rays, Vec3 camera, const float* plate,
-                          bool difference, const uint16_t* counts, float* film) const {
+uint64_t Compositor::pass(const Camera& camera, const float* plate, bool difference,
+                          const uint16_t* counts, float* film) const {
+  const PixelRays& rays = camera.rays;
   std::atomic<uint64_t> traced{0};
   const tbb::blocked_range2d<int> tiles(0, rays.height, 8, 0, rays.width, 8);
   tbb::parallel_for(tiles, [&](const auto& tile) {
@@ -298,7 +299,7 @@ uint64_t Compositor::pass(const PixelRays& rays, Vec3 camera, const float* plate
     uint64_t tile_rays = 0;
     for (int y = tile.rows().begin(); y < tile.rows().end(); ++y) {
       for (int x = tile.cols().begin(); x < tile.cols().end(); ++x) {
-        if (!is_finite(rays.direction(y, x, 0.5f, 0.5f))) continue;
+        if (!camera.sees(y, x)) continue;
         const size_t pixel = size_t(y) * rays.width + x;
         float* to = film + Film::kCount * pixel;
         const Vec3 B(plate + 3 * pixel);
@@ -307,11 +308,11 @@ uint64_t Compositor::pass(const PixelRays& rays, Vec3 camera, const float* plate
         for (uint32_t i = first; i < first + counts[pixel]; ++i) {
           Sampler sampler(table_, seed_ + pixel, i);
           Path path{sampler};
-          const Pair u = sampler.pair();
-          const Vec3 d = rays.direction(y, x, u.x, u.y);
-          const Place place = meet_stand_in(camera, d, kInfinity, path);
+          const auto [o, d, time] = camera.sample(y, x, sampler);
+          path.time = time;
+          const Place place = meet_stand_in(o, d, kInfinity, path);
           Vec3 through(1.0f);
-          const Hit hit = meet_object(camera, d, place.t, through, path);
+          const Hit hit = meet_object(o, d, place.t, through, path);
           Vec3 value = B;
           if (hit) {
             value = through * object_radiance(hit, d, bounces_, path);
@@ -350,21 +351,20 @@ uint64_t Compositor::pass(const PixelRays& rays, Vec3 camera, const float* plate
   return traced;
 }
 
-void Compositor::background(const PixelRays& rays, Vec3 camera, uint32_t count,
-                            float* radiance) const {
+void Compositor::background(const Camera& camera, uint32_t count, float* radiance) const {
+  const PixelRays& rays = camera.rays;
   const tbb::blocked_range2d<int> tiles(0, rays.height, 16, 0, rays.width, 16);
   tbb::parallel_for(tiles, [&](const auto& tile) {
     const FlushDenormals flush;
     for (int y = tile.rows().begin(); y < tile.rows().end(); ++y) {
       for (int x = tile.cols().begin(); x < tile.cols().end(); ++x) {
-        if (!is_finite(rays.direction(y, x, 0.5f, 0.5f))) continue;
+        if (!camera.sees(y, x)) continue;
         const size_t pixel = size_t(y) * rays.width + x;
         Vec3 sum;
         for (uint32_t i = 0; i < count; ++i) {
           Sampler sampler(table_, ~seed_ + pixel, i);
-          const Pair u = sampler.pair();
-          const Vec3 d = rays.direction(y, x, u.x, u.y);
-          sum += captured_.radiance(captured_.trace(camera, d), d);
+          const CameraRay ray = camera.sample(y, x, sampler);
+          sum += captured_.radiance(captured_.trace(ray.o, ray.d), ray.d);
         }
         add(radiance + 3 * pixel, sum * (1.0f / float(count)));
       }

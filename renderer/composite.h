@@ -39,15 +39,15 @@ class Compositor {
   // Other objects.
   void place(World& objects);
   // A new place for an object.
-  void move(uint32_t object, const double* matrix);
+  void move(uint32_t object, const double* matrices, size_t steps = 1);
 
   // Adds the next counts (H, W) sub-samples of each pixel to film (H, W, Film::kCount).
   // `plate` (H, W, 3) is only used to know how bright a change is. Returns rays traced.
-  uint64_t pass(const PixelRays& rays, Vec3 camera, const float* plate, bool difference,
+  uint64_t pass(const Camera& camera, const float* plate, bool difference,
                 const uint16_t* counts, float* film) const;
 
   // The captured set alone through the camera, mean of `count` sub-samples: a plate.
-  void background(const PixelRays& rays, Vec3 camera, uint32_t count, float* radiance) const;
+  void background(const Camera& camera, uint32_t count, float* radiance) const;
 
   // At a point on or near a surface.
   Vec3 irradiance(Vec3 p, Vec3 n) const {
@@ -58,6 +58,7 @@ class Compositor {
   struct Path {
     Sampler& sampler;
     uint64_t rays = 0;
+    float time = 0;  // of the shutter's opening
   };
 
   // The first object that does not let the ray through; multiplies `share` by what comes through

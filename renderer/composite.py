@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from chromeball.renderer import core
 from chromeball.renderer.delta_light import DeltaLight
+from chromeball.renderer.lens import Lens
 from chromeball.renderer.mesh import Instance, Mesh, Values, affine
 from chromeball.renderer.world import moved_back, triple, world
 from chromeball.scene.errors import UserError
@@ -147,6 +148,8 @@ class Compositor:
     filtered
         Whether ``direct`` smooths the light that it found over neighbours on one surface, by no
         more than its noise. The plate is never smoothed.
+    lens
+        Pixel filter, aperture and shutter; none: a pinhole that sees the pixels' area.
 
     """
 
@@ -166,6 +169,7 @@ class Compositor:
         plate_samples: int = 16,
         integrator: Integrator = "path",
         filtered: bool = True,
+        lens: Lens | None = None,
     ) -> None:
         if integrator == "ao":
             if plate is None:
@@ -189,22 +193,28 @@ class Compositor:
         )
         self._direct = None if integrator == "path" else core.Direct(self._core, seed)
         self._filtered = filtered
-        self.look(rays, camera, plate)
+        self.look(rays, camera, plate, lens)
 
     def look(
         self,
         rays: NDArray[np.float32],
         camera: Values,
         plate: NDArray[np.float32] | None = None,
+        lens: Lens | None = None,
     ) -> None:
         """Start over with another camera and plate; the world stays as it is built."""
         self._rays = np.ascontiguousarray(rays, np.float32)
-        self._camera = triple(np.subtract(camera, self._about))
+        self._place = triple(np.subtract(camera, self._about))
         height, width = self._rays.shape[0] - 1, self._rays.shape[1] - 1
         if height < 1 or width < 1:
             raise UserError(f"a picture of {height} x {width} has no pixels")
+        self._camera = (lens or Lens()).core(self._rays, self._place)
+        if self._direct is not None and lens is not None and not lens.plain:
+            raise UserError(
+                "the direct integrator has no aperture, shutter or filter: take path for them"
+            )
         if plate is None:
-            plate = self.background(rays, camera, self._plate_samples)
+            plate = self._core.background(self._camera, self._plate_samples)
         self.plate = np.ascontiguousarray(plate, np.float32)
         if self.plate.shape != (height, width, 3):
             raise ValueError(f"plate is {self.plate.shape}, rays are for {height} x {width}")
@@ -219,7 +229,7 @@ class Compositor:
         """The captured set alone, (H, W, 3), seen by a camera with `samples` a pixel."""
         rays = np.ascontiguousarray(rays, np.float32)
         place = triple(np.subtract(camera, self._about))
-        return self._core.background(rays, place, samples)
+        return self._core.background(Lens().core(rays, place), samples)
 
     def place(
         self,
@@ -244,7 +254,8 @@ class Compositor:
         :class:`Instance`, whose ``inner`` stays. Raises IndexError where there is no such
         object.
         """
-        self._core.move(k, moved_back(affine(pose, scale, self._inner[k]), self._about))
+        matrix = affine(pose, scale, self._inner[k])
+        self._core.move(k, moved_back(matrix, self._about)[None])
         self._moved()
 
     def _moved(self) -> None:
@@ -268,7 +279,7 @@ class Compositor:
                 raise UserError("tiles are for the path integrator: direct makes whole frames")
             for count in [_DIRECT_PASS] * (samples // _DIRECT_PASS) + [samples % _DIRECT_PASS]:
                 if count:
-                    self.rays_traced += self._direct.add(self._rays, self._camera, count)
+                    self.rays_traced += self._direct.add(self._rays, self._place, count)
             self.samples += samples
             return
         counts = np.full(self._film.shape[:2], samples, np.uint16)
@@ -322,7 +333,7 @@ class Compositor:
 
     def _add(self, counts: NDArray[np.uint16]) -> None:
         self.rays_traced += self._core.add(
-            self._rays, self._camera, self.plate, self._difference, counts, self._film
+            self._camera, self.plate, self._difference, counts, self._film
         )
 
     def _relative_deviation(self) -> NDArray[np.float64]:
@@ -347,7 +358,7 @@ class Compositor:
     def _resolve(self, layers: bool) -> tuple[NDArray[np.float32], NDArray[np.float32], int]:
         assert self._direct is not None
         return self._direct.resolve(
-            self._rays, self._camera, self.plate, self._difference, self._filtered, layers
+            self._rays, self._place, self.plate, self._difference, self._filtered, layers
         )
 
     def _direct_result(self) -> Composite:

@@ -22,7 +22,8 @@ using In3f = nb::ndarray<const float, nb::shape<-1, 3>, nb::c_contig, nb::device
 using In3u = nb::ndarray<const uint32_t, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
 using In2f = nb::ndarray<const float, nb::shape<-1, 2>, nb::c_contig, nb::device::cpu>;
 using In1u = nb::ndarray<const uint32_t, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
-using Matrix = nb::ndarray<const double, nb::shape<3, 4>, nb::c_contig, nb::device::cpu>;
+using Matrices = nb::ndarray<const double, nb::shape<-1, 3, 4>, nb::c_contig, nb::device::cpu>;
+using In1f = nb::ndarray<const float, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
 using In1b = nb::ndarray<const uint8_t, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
 using Picture = nb::ndarray<const float, nb::shape<-1, -1, 3>, nb::c_contig, nb::device::cpu>;
 using Pixels = nb::ndarray<const float, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
@@ -127,8 +128,20 @@ class CompositorArrays {
   std::optional<Compositor> compositor_;
 };
 
+// A camera and the arrays that it looks at.
+struct CameraArrays {
+  Picture corners;
+  std::optional<In1f> filter;
+  Camera camera;
+};
+
 PixelRays pixel_rays(const Picture& corners) {
   return {corners.data(), int(corners.shape(0)) - 1, int(corners.shape(1)) - 1};
+}
+
+size_t steps(const Matrices& matrices) {
+  if (matrices.shape(0) < 1) throw nb::value_error("no matrix");
+  return matrices.shape(0);
 }
 
 // The first hit of each ray: distance (inf: none), place, normal of the face on the ray's side,
@@ -213,6 +226,26 @@ Out transmittance(const WorldArrays& self, In3f origins, In3f directions) {
 }  // namespace
 
 NB_MODULE(core, m) {
+  nb::class_<CameraArrays>(m, "Camera")
+      .def("__init__",
+           [](CameraArrays* self, Picture corners, std::array<float, 3> origin,
+              std::optional<In1f> filter, float radius, float focus, std::array<float, 3> axis,
+              bool shutter, std::array<float, 3> shift, std::array<float, 3> pivot,
+              float angle) {
+             if (corners.shape(0) < 1 || corners.shape(1) < 1) throw nb::value_error("no corners");
+             if (filter && filter->shape(0) < 2) throw nb::value_error("a filter of one quantile");
+             Lens lens;
+             if (filter) lens.filter = filter->data(), lens.quantiles = int(filter->shape(0));
+             lens.radius = radius, lens.focus = focus, lens.axis = Vec3(axis.data());
+             lens.shutter = shutter, lens.shift = Vec3(shift.data());
+             lens.pivot = Vec3(pivot.data()), lens.angle = angle;
+             const Camera camera{pixel_rays(corners), Vec3(origin.data()), lens};
+             new (self) CameraArrays{corners, filter, camera};
+           },
+           nb::kw_only(), nb::arg("corners"), nb::arg("origin"), nb::arg("filter").none(),
+           nb::arg("radius"), nb::arg("focus"), nb::arg("axis"), nb::arg("shutter"),
+           nb::arg("shift"), nb::arg("pivot"), nb::arg("angle"));
+
   nb::class_<WorldArrays>(m, "World")
       .def(nb::init<>())
       .def(
@@ -258,10 +291,10 @@ NB_MODULE(core, m) {
            nb::arg("uv").none(), nb::arg("faces"), nb::arg("material"))
       .def(
           "place",
-          [](WorldArrays& self, uint32_t mesh, Matrix matrix) {
-            return self.world.place(mesh, matrix.data());
+          [](WorldArrays& self, uint32_t mesh, Matrices matrices) {
+            return self.world.place(mesh, matrices.data(), steps(matrices));
           },
-          nb::arg("mesh"), nb::arg("matrix"))
+          nb::arg("mesh"), nb::arg("matrices"))
       .def("commit", [](WorldArrays& self) { self.world.commit(); })
       .def("hits", &hits, nb::arg("origins"), nb::arg("directions"))
       .def("evaluate", &evaluate, nb::arg("origin"), nb::arg("ray"), nb::arg("directions"))
@@ -271,10 +304,10 @@ NB_MODULE(core, m) {
 
   m.def(
       "path_trace",
-      [](const WorldArrays& arrays, Picture corners, std::array<float, 3> origin, int spp,
-         uint64_t seed, int bounces, std::optional<Picture> environment,
-         std::optional<In3f> irradiance, float gather_from) {
-        const PixelRays rays = pixel_rays(corners);
+      [](const WorldArrays& arrays, const CameraArrays& camera, int spp, uint64_t seed,
+         int bounces, std::optional<Picture> environment, std::optional<In3f> irradiance,
+         float gather_from) {
+        const PixelRays& rays = camera.camera.rays;
         NewPicture out(rays.height, rays.width, 3);
         {
           nb::gil_scoped_release release;
@@ -283,15 +316,13 @@ NB_MODULE(core, m) {
             light.emplace(environment->data(), int(environment->shape(0)),
                           int(environment->shape(1)));
           }
-          path_trace(arrays.world, rays, Vec3(origin.data()), spp, seed, bounces,
-                     light ? &*light : nullptr, irradiance ? irradiance->data() : nullptr,
-                     gather_from, out.data);
+          path_trace(arrays.world, camera.camera, spp, seed, bounces, light ? &*light : nullptr,
+                     irradiance ? irradiance->data() : nullptr, gather_from, out.data);
         }
         return out.release();
       },
-      nb::arg("world"), nb::arg("corners"), nb::arg("origin"), nb::arg("spp"), nb::arg("seed"),
-      nb::arg("bounces"), nb::arg("environment").none(), nb::arg("irradiance").none(),
-      nb::arg("gather_from"));
+      nb::arg("world"), nb::arg("camera"), nb::arg("spp"), nb::arg("seed"), nb::arg("bounces"),
+      nb::arg("environment").none(), nb::arg("irradiance").none(), nb::arg("gather_from"));
 
   m.def(
       "irradiance",
@@ -331,15 +362,15 @@ NB_MODULE(core, m) {
       .def("place", &CompositorArrays::place, nb::arg("objects"))
       .def(
           "move",
-          [](CompositorArrays& self, uint32_t object, Matrix matrix) {
-            self->move(object, matrix.data());
+          [](CompositorArrays& self, uint32_t object, Matrices matrices) {
+            self->move(object, matrices.data(), steps(matrices));
           },
-          nb::arg("object"), nb::arg("matrix"))
+          nb::arg("object"), nb::arg("matrices"))
       .def(
           "add",
-          [](const CompositorArrays& self, Picture corners, std::array<float, 3> camera,
-             Picture plate, bool difference, Counts counts, InOut film) {
-            const PixelRays rays = pixel_rays(corners);
+          [](const CompositorArrays& self, const CameraArrays& camera, Picture plate,
+             bool difference, Counts counts, InOut film) {
+            const PixelRays& rays = camera.camera.rays;
             for (const auto& a : {std::pair(plate.shape(0), plate.shape(1)),
                                   std::pair(counts.shape(0), counts.shape(1)),
                                   std::pair(film.shape(0), film.shape(1))}) {
@@ -348,24 +379,22 @@ NB_MODULE(core, m) {
               }
             }
             nb::gil_scoped_release release;
-            return self->pass(rays, Vec3(camera.data()), plate.data(), difference, counts.data(),
-                              film.data());
+            return self->pass(camera.camera, plate.data(), difference, counts.data(), film.data());
           },
-          nb::arg("corners"), nb::arg("camera"), nb::arg("plate"), nb::arg("difference"),
-          nb::arg("counts"), nb::arg("film").noconvert())
+          nb::arg("camera"), nb::arg("plate"), nb::arg("difference"), nb::arg("counts"),
+          nb::arg("film").noconvert())
       .def(
           "background",
-          [](const CompositorArrays& self, Picture corners, std::array<float, 3> camera,
-             uint32_t count) {
-            const PixelRays rays = pixel_rays(corners);
+          [](const CompositorArrays& self, const CameraArrays& camera, uint32_t count) {
+            const PixelRays& rays = camera.camera.rays;
             NewPicture out(rays.height, rays.width, 3);
             {
               nb::gil_scoped_release release;
-              self->background(rays, Vec3(camera.data()), count, out.data);
+              self->background(camera.camera, count, out.data);
             }
             return out.release();
           },
-          nb::arg("corners"), nb::arg("camera"), nb::arg("count"))
+          nb::arg("camera"), nb::arg("count"))
       .def(
           "irradiance",
           [](const CompositorArrays& self, std::array<float, 3> p, std::array<float, 3> n) {

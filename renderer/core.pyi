@@ -39,7 +39,7 @@ class World:
         faces: NDArray[uint32],
         material: NDArray[uint32],
     ) -> int: ...
-    def place(self, mesh: int, matrix: NDArray[float64]) -> int: ...
+    def place(self, mesh: int, matrices: NDArray[float64]) -> int: ...
     def commit(self) -> None: ...
     def hits(
         self, origins: NDArray[float32], directions: NDArray[float32]
@@ -61,10 +61,25 @@ class World:
         self, origins: NDArray[float32], directions: NDArray[float32]
     ) -> NDArray[float32]: ...
 
+class Camera:
+    def __init__(
+        self,
+        *,
+        corners: NDArray[float32],
+        origin: tuple[float, float, float],
+        filter: NDArray[float32] | None,
+        radius: float,
+        focus: float,
+        axis: tuple[float, float, float],
+        shutter: bool,
+        shift: tuple[float, float, float],
+        pivot: tuple[float, float, float],
+        angle: float,
+    ) -> None: ...
+
 def path_trace(
     world: World,
-    corners: NDArray[float32],
-    origin: tuple[float, float, float],
+    camera: Camera,
     spp: int,
     seed: int,
     bounces: int,
@@ -102,19 +117,16 @@ class Compositor:
         samples: int,
     ) -> None: ...
     def place(self, objects: World) -> None: ...
-    def move(self, object: int, matrix: NDArray[float64]) -> None: ...
+    def move(self, object: int, matrices: NDArray[float64]) -> None: ...
     def add(
         self,
-        corners: NDArray[float32],
-        camera: tuple[float, float, float],
+        camera: Camera,
         plate: NDArray[float32],
         difference: bool,
         counts: NDArray[uint16],
         film: NDArray[float32],
     ) -> int: ...
-    def background(
-        self, corners: NDArray[float32], camera: tuple[float, float, float], count: int
-    ) -> NDArray[float32]: ...
+    def background(self, camera: Camera, count: int) -> NDArray[float32]: ...
     def irradiance(
         self, point: tuple[float, float, float], normal: tuple[float, float, float]
     ) -> list[float]: ...

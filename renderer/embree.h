@@ -27,6 +27,7 @@ struct Hit {
   float u = 0, v = 0;
   uint32_t face = RTC_INVALID_GEOMETRY_ID;
   uint32_t instance = RTC_INVALID_GEOMETRY_ID;  // of a scene without instances: the geometry
+  float time = 0;  // of the shutter's opening, 0..1
   explicit operator bool() const { return instance != RTC_INVALID_GEOMETRY_ID; }
 };
 
@@ -106,17 +107,17 @@ inline Triangles attach_triangles(const Device& device, RTCScene scene, const fl
   return {to_v, to_f, f};
 }
 
-inline RTCRay make_ray(Vec3 o, Vec3 d, float tfar) {
+inline RTCRay make_ray(Vec3 o, Vec3 d, float tfar, float time) {
   RTCRay r;
   r.org_x = o.x, r.org_y = o.y, r.org_z = o.z;
   r.dir_x = d.x, r.dir_y = d.y, r.dir_z = d.z;
-  r.tnear = 0, r.tfar = tfar, r.time = 0, r.mask = ~0u, r.id = 0, r.flags = 0;
+  r.tnear = 0, r.tfar = tfar, r.time = time, r.mask = ~0u, r.id = 0, r.flags = 0;
   return r;
 }
 
-inline Hit intersect(RTCScene scene, Vec3 o, Vec3 d, float tfar) {
+inline Hit intersect(RTCScene scene, Vec3 o, Vec3 d, float tfar, float time = 0) {
   RTCRayHit r;
-  r.ray = make_ray(o, d, tfar);
+  r.ray = make_ray(o, d, tfar, time);
   r.hit.geomID = RTC_INVALID_GEOMETRY_ID;
   r.hit.primID = RTC_INVALID_GEOMETRY_ID;
   r.hit.instID[0] = RTC_INVALID_GEOMETRY_ID;
@@ -129,11 +130,11 @@ inline Hit intersect(RTCScene scene, Vec3 o, Vec3 d, float tfar) {
 #endif
   const uint32_t in = r.hit.instID[0];
   return {r.ray.tfar, r.hit.u, r.hit.v, r.hit.primID,
-          in != RTC_INVALID_GEOMETRY_ID ? in : r.hit.geomID};
+          in != RTC_INVALID_GEOMETRY_ID ? in : r.hit.geomID, time};
 }
 
-inline bool occluded(RTCScene scene, Vec3 o, Vec3 d, float tfar) {
-  RTCRay r = make_ray(o, d, tfar);
+inline bool occluded(RTCScene scene, Vec3 o, Vec3 d, float tfar, float time = 0) {
+  RTCRay r = make_ray(o, d, tfar, time);
 #if CHROMEBALL_EMBREE >= 4
   rtcOccluded1(scene, &r);
 #else

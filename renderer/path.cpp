@@ -27,11 +27,12 @@ class PathIntegrator {
   }
 
   // bsdf_density of d; 0: the last bounce was certain, or this is the camera ray.
-  Vec3 radiance(Vec3 o, Vec3 d, Sampler& sampler, float bsdf_density = 0, int depth = 0) const {
+  Vec3 radiance(Vec3 o, Vec3 d, Sampler& sampler, float time, float bsdf_density = 0,
+                int depth = 0) const {
     Vec3 sum, beta(1.0f), from = o;  // where the direction was chosen
     int passed = 0;  // surfaces that let the ray through: no scatterings
     for (;; ++depth) {
-      const Hit hit = world_.intersect(o, d);
+      const Hit hit = world_.intersect(o, d, kInfinity, time);
       if (!hit) {
         if (environment_) {
           const float w = bsdf_density == 0
@@ -72,7 +73,7 @@ class PathIntegrator {
           const Vec3 known = world_.interpolate(irradiance_, hit);
           if (is_finite(known)) return sum + (1 / kPi) * beta * s.base * known;
         }
-        sum += beta * (direct(s, -d, sampler) + lamps(s, -d));
+        sum += beta * (direct(s, -d, sampler, time) + lamps(s, -d, time));
       }
       const Scatter next = sample(s, -d, sampler);
       beta *= next.weight;
@@ -96,9 +97,9 @@ class PathIntegrator {
     Surface s{};
     s.p = p, s.ng = s.ns = n, s.rise = near(p);
     s.base = Vec3(1.0f), s.alpha = 1, s.outside = true;
-    const Vec3 sum = direct(s, n, sampler) + lamps(s, n);
+    const Vec3 sum = direct(s, n, sampler, 0) + lamps(s, n, 0);
     const Scatter next = sample(s, n, sampler);
-    return kPi * (sum + radiance(s.start(next.wi), next.wi, sampler, next.density, 1));
+    return kPi * (sum + radiance(s.start(next.wi), next.wi, sampler, 0, next.density, 1));
   }
 
  private:
@@ -106,18 +107,18 @@ class PathIntegrator {
   static float near(Vec3 p) { return 8 * kLift * largest_magnitude(p); }
 
   // Lights without size, all of them.
-  Vec3 lamps(const Surface& s, Vec3 wo) const {
+  Vec3 lamps(const Surface& s, Vec3 wo, float time) const {
     Vec3 sum;
     for (const DeltaLight& light : world_.delta_lights()) {
       const auto in = light.incident(s.p);
       const Vec3 f = is_zero(in.irradiance) ? Vec3() : shade(s, wo, in.d) * in.irradiance;
-      if (!is_zero(f)) sum += f * world_.transmittance(s.start(in.d), in.d, in.t);
+      if (!is_zero(f)) sum += f * world_.transmittance(s.start(in.d), in.d, in.t, time);
     }
     return sum;
   }
 
   // One light sample, weighted against the surface's own: radiance that it sends to wo.
-  Vec3 direct(const Surface& s, Vec3 wo, Sampler& sampler) const {
+  Vec3 direct(const Surface& s, Vec3 wo, Sampler& sampler, float time) const {
     if (pick_environment_ == 0 && !world_.shines()) return {};
     Pair u = sampler.pair();
     bool sky = pick_environment_ == 1;
@@ -129,13 +130,14 @@ class PathIntegrator {
       const auto light = environment_->sample(u.bits, u.y);
       const Vec3 f = shade(s, wo, light.direction);
       if (is_zero(f)) return {};
-      const Vec3 share = world_.transmittance(s.start(light.direction), light.direction);
+      const Vec3 share = world_.transmittance(s.start(light.direction), light.direction,
+                                              kInfinity, time);
       if (is_zero(share)) return {};
       const float p = pick_environment_ * light.density;
       const float w = power_heuristic(p, density(s, wo, light.direction));
       return (w / p) * share * f * environment_->radiance(light.direction);
     }
-    const World::Emitter light = world_.sample_emitter(u);
+    const World::Emitter light = world_.sample_emitter(u, time);
     const Vec3 n = dot(light.n, s.p - light.p) < 0 ? -light.n : light.n;
     const Vec3 start = s.start(light.p - s.p);
     const Vec3 to = light.p + light.rise * n - start;
@@ -145,7 +147,7 @@ class PathIntegrator {
     if (!(cos_light > 0)) return {};
     const Vec3 f = shade(s, wo, d);
     if (is_zero(f)) return {};
-    const Vec3 share = world_.transmittance(start, to, 1 - kLift);
+    const Vec3 share = world_.transmittance(start, to, 1 - kLift, time);
     if (is_zero(share)) return {};
     const float p = (1 - pick_environment_) * light.density * distance2 / cos_light;
     const float w = power_heuristic(p, density(s, wo, d));
@@ -162,9 +164,10 @@ class PathIntegrator {
 
 }  // namespace
 
-void path_trace(const World& world, const PixelRays& rays, Vec3 origin, int spp, uint64_t seed,
-                int bounces, const Environment* environment, const float* irradiance,
-                float gather_from, float* radiance) {
+void path_trace(const World& world, const Camera& camera, int spp, uint64_t seed, int bounces,
+                const Environment* environment, const float* irradiance, float gather_from,
+                float* radiance) {
+  const PixelRays& rays = camera.rays;
   const PathIntegrator integrator(world, environment, bounces, irradiance, gather_from);
   const SampleTable table(spp, seed);
   const tbb::blocked_range2d<int> tiles(0, rays.height, 16, 0, rays.width, 16);
@@ -174,11 +177,11 @@ void path_trace(const World& world, const PixelRays& rays, Vec3 origin, int spp,
       for (int x = tile.cols().begin(); x < tile.cols().end(); ++x) {
         const size_t pixel = size_t(y) * rays.width + x;
         Vec3 sum;
-        if (is_finite(rays.direction(y, x, 0.5f, 0.5f))) {
+        if (camera.sees(y, x)) {
           for (int i = 0; i < spp; ++i) {
             Sampler sampler(table, mix64(seed) + pixel, i);
-            const Pair u = sampler.pair();
-            sum += integrator.radiance(origin, rays.direction(y, x, u.x, u.y), sampler);
+            const CameraRay ray = camera.sample(y, x, sampler);
+            sum += integrator.radiance(ray.o, ray.d, sampler, ray.time);
           }
         }
         const Vec3 out = sum * (1.0f / float(spp));

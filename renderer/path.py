@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from chromeball.renderer import core
 from chromeball.renderer.delta_light import DeltaLight
-from chromeball.renderer.mesh import Mesh, Values
+from chromeball.renderer.lens import Lens
+from chromeball.renderer.mesh import Instance, Mesh, Values
 from chromeball.renderer.world import world
 from chromeball.scene.camera import CameraModel
 
@@ -30,7 +31,7 @@ def corner_rays(camera: CameraModel) -> NDArray[np.float32]:
 
 
 def path_trace(
-    mesh: Mesh,
+    mesh: Mesh | Instance,
     rays: NDArray[np.float32],
     origin: Values,
     *,
@@ -41,13 +42,14 @@ def path_trace(
     lights: Sequence[DeltaLight] = (),
     irradiance: NDArray[np.float32] | None = None,
     gather_from: float = 0.0,
+    lens: Lens | None = None,
 ) -> NDArray[np.float32]:
     """Radiance (H, W, 3) float32 that a camera sees, the mean of `spp` paths a pixel.
 
     Parameters
     ----------
     mesh
-        The set: diffuse, mirror and glass faces that may shine.
+        The set: diffuse, mirror and glass faces that may shine; an instance may move.
     rays
         (H + 1, W + 1, 3) directions at the pixels' corners (:func:`corner_rays`); a pixel
         with a NaN corner is outside the lens and 0.
@@ -66,17 +68,18 @@ def path_trace(
     irradiance, gather_from
         (V, 3) known at the vertices: a path ends where it meets a second diffuse surface more
         than `gather_from` metres away; NaN where unknown (:mod:`chromeball.renderer.gather`).
+    lens
+        Pixel filter, aperture and shutter; none: a pinhole that sees the pixels' area.
 
     """
     if spp < 1 or max_bounces < 0:
         raise ValueError("spp must be at least 1, max_bounces at least 0")
-    if irradiance is not None and len(irradiance) != len(mesh.vertices):
+    vertices = (mesh.mesh if isinstance(mesh, Instance) else mesh).vertices
+    if irradiance is not None and len(irradiance) != len(vertices):
         raise ValueError("irradiance and vertices differ in length")
-    x, y, z = (float(v) for v in np.asarray(origin, float))
     return core.path_trace(
         world([mesh], lights),
-        np.ascontiguousarray(rays, np.float32),
-        (x, y, z),
+        (lens or Lens()).core(rays, origin),
         spp,
         seed,
         max_bounces,

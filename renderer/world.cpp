@@ -109,7 +109,57 @@ uint32_t World::add(const MeshView& view) {
   return uint32_t(meshes_.size() - 1);
 }
 
-void World::set(Instance& instance, const double* m) {
+Mat3 larger(const Mat3& a, const Mat3& b) {
+  const auto row = [](Vec3 a, Vec3 b) {
+    return Vec3(std::max(a.x, b.x), std::max(a.y, b.y), std::max(a.z, b.z));
+  };
+  return {row(a.x, b.x), row(a.y, b.y), row(a.z, b.z)};
+}
+
+void World::set(Instance& instance, const double* matrices, size_t steps) {
+  rtcSetGeometryTimeStepCount(instance.geometry.get(), uint32_t(steps));
+  instance.steps.clear();
+  set_step(instance, matrices, 0);
+  if (steps > 1) {
+    const Instance first{0, {}, instance.to_world, instance.normal, {}, {}, {}, 0, {}};
+    Mat3 size = instance.size, spread = instance.spread;
+    Vec3 slack = instance.slack;
+    float scale = instance.scale;
+    instance.steps.push_back(instance.to_world);
+    for (size_t k = 1; k < steps; ++k) {
+      set_step(instance, matrices + 12 * k, uint32_t(k));
+      instance.steps.push_back(instance.to_world);
+      size = larger(size, instance.size), spread = larger(spread, instance.spread);
+      slack = larger({slack, {}, {}}, {instance.slack, {}, {}}).x;
+      scale = std::max(scale, instance.scale);
+    }
+    // steps turn little, so that what lies between two of them has about their inverse
+    instance.size = size, instance.spread = {1.2f * spread.x, 1.2f * spread.y, 1.2f * spread.z};
+    instance.slack = 1.2f * slack, instance.scale = scale;
+    instance.to_world = first.to_world, instance.normal = first.normal;
+  }
+  rtcCommitGeometry(instance.geometry.get());
+}
+
+World::Moment World::moment(const Instance& instance, float time) {
+  if (instance.steps.empty()) return {instance.to_world, instance.normal};
+  const float at = time * float(instance.steps.size() - 1);
+  const size_t k = std::min(size_t(at), instance.steps.size() - 2);
+  const float w = at - float(k);
+  const auto between = [w](Vec3 a, Vec3 b) { return (1 - w) * a + w * b; };
+  const Affine &a = instance.steps[k], &b = instance.steps[k + 1];
+  const Mat3 m{between(a.linear.x, b.linear.x), between(a.linear.y, b.linear.y),
+               between(a.linear.z, b.linear.z)};
+  // the cofactors are the inverse transpose times the determinant
+  Mat3 normal{cross(m.y, m.z), cross(m.z, m.x), cross(m.x, m.y)};
+  const float common = largest_magnitude({largest_magnitude(normal.x),
+                                          largest_magnitude(normal.y),
+                                          largest_magnitude(normal.z)});
+  const float factor = std::copysign(1 / common, dot(m.x, normal.x));
+  return {{m, between(a.t, b.t)}, {factor * normal.x, factor * normal.y, factor * normal.z}};
+}
+
+void World::set_step(Instance& instance, const double* m, uint32_t step) {
   const auto row = [](const double* r) { return Vec3(float(r[0]), float(r[1]), float(r[2])); };
   const double* r[3] = {m, m + 4, m + 8};
   double inverse[3][3], determinant = 0;
@@ -155,18 +205,17 @@ void World::set(Instance& instance, const double* m) {
                             columns.y.y, columns.y.z, columns.z.x, columns.z.y,
                             columns.z.z, instance.to_world.t.x, instance.to_world.t.y,
                             instance.to_world.t.z};
-  rtcSetGeometryTransform(instance.geometry.get(), 0, RTC_FORMAT_FLOAT3X4_COLUMN_MAJOR, matrix);
-  rtcCommitGeometry(instance.geometry.get());
+  rtcSetGeometryTransform(instance.geometry.get(), step, RTC_FORMAT_FLOAT3X4_COLUMN_MAJOR,
+                          matrix);
 }
 
-uint32_t World::place(uint32_t mesh, const double* matrix) {
+uint32_t World::place(uint32_t mesh, const double* matrices, size_t steps) {
   if (!top_) top_ = device_.scene(RTC_BUILD_QUALITY_LOW);
   Instance instance{};
   instance.mesh = mesh;
   instance.geometry.reset(rtcNewGeometry(device_.get(), RTC_GEOMETRY_TYPE_INSTANCE));
   rtcSetGeometryInstancedScene(instance.geometry.get(), meshes_[mesh].scene.get());
-  rtcSetGeometryTimeStepCount(instance.geometry.get(), 1);
-  set(instance, matrix);
+  set(instance, matrices, steps);
   const uint32_t k = uint32_t(instances_.size());
   rtcAttachGeometryByID(top_.get(), instance.geometry.get(), k);
   instances_.push_back(std::move(instance));
@@ -181,9 +230,9 @@ void World::commit() {
   find_emitters();
 }
 
-void World::move(uint32_t k, const double* matrix) {
+void World::move(uint32_t k, const double* matrices, size_t steps) {
   if (k >= instances_.size()) throw std::out_of_range("there is no such instance");
-  set(instances_[k], matrix);
+  set(instances_[k], matrices, steps);
   rtcCommitScene(top_.get());
   device_.check();
   find_bounds();
@@ -211,9 +260,16 @@ void World::find_bounds() {
   bounds_.clear();
   for (const Instance& i : instances_) {
     for (const Sphere& s : meshes_[i.mesh].bounds) {
-      const Vec3 c = i.to_world.point(s.centre);
+      Vec3 low = i.to_world.point(s.centre), high = low;  // of the centre's path
+      for (const Affine& step : i.steps) {
+        const Vec3 c = step.point(s.centre);
+        low = {std::min(low.x, c.x), std::min(low.y, c.y), std::min(low.z, c.z)};
+        high = {std::max(high.x, c.x), std::max(high.y, c.y), std::max(high.z, c.z)};
+      }
+      const Vec3 c = 0.5f * low + 0.5f * high;
       const float rounding = kLift * (largest_magnitude(c) + largest_magnitude(i.slack));
-      bounds_.push_back({c, s.radius * i.scale * (1 + 1e-5f) + rounding});
+      const float path = 0.5f * length(high - low);
+      bounds_.push_back({c, s.radius * i.scale * (1 + 1e-5f) + path + rounding});
     }
   }
 }
@@ -247,6 +303,7 @@ Vec3 World::interpolate(const float* values, const Hit& hit) const {
 
 Surface World::surface_at(const Hit& hit, Vec3 d) const {
   const Instance& instance = instances_[hit.instance];
+  const auto [to_world, normal] = moment(instance, hit.time);
   const MeshData& mesh = meshes_[instance.mesh];
   const uint32_t* f = mesh.triangles.faces + 3 * hit.face;
   const float* vertices = mesh.triangles.vertices;
@@ -257,11 +314,11 @@ Surface World::surface_at(const Hit& hit, Vec3 d) const {
   Surface s;
   s.material = &m;
   // nearer to the face than o + t d
-  s.p = instance.to_world.point(w * a + hit.u * b + hit.v * c);
+  s.p = to_world.point(w * a + hit.u * b + hit.v * c);
   const Vec3 e1 = b - a, e2 = c - a;
   // edges of a common size: their product must not vanish for tiny faces
   const float grow = 1 / std::max(std::max(largest_magnitude(e1), largest_magnitude(e2)), 1e-37f);
-  s.ng = unit_or(instance.normal * cross(e1 * grow, e2 * grow), -d);
+  s.ng = unit_or(normal * cross(e1 * grow, e2 * grow), -d);
   s.outside = dot(s.ng, d) < 0;
   if (!s.outside) s.ng = -s.ng;
   const Vec3 size = instance.size * (w * abs(a) + hit.u * abs(b) + hit.v * abs(c)) +
@@ -274,7 +331,7 @@ Surface World::surface_at(const Hit& hit, Vec3 d) const {
     const Vec3 n = w * Vec3(normals + 3 * f[0]) + hit.u * Vec3(normals + 3 * f[1]) +
                    hit.v * Vec3(normals + 3 * f[2]);
     if (length2(n) > 1e-12f) {
-      const Vec3 smooth = unit_or(instance.normal * n, s.ng);
+      const Vec3 smooth = unit_or(normal * n, s.ng);
       ns = s.outside ? smooth : -smooth;
     }
   }
@@ -289,7 +346,7 @@ Surface World::surface_at(const Hit& hit, Vec3 d) const {
       const float u1 = tb[0] - ta[0], v1 = tb[1] - ta[1];
       const float u2 = tc[0] - ta[0], v2 = tc[1] - ta[1];
       const float turn = u1 * v2 - u2 * v1 < 0 ? -1.0f : 1.0f;
-      const Mat3& linear = instance.to_world.linear;
+      const Mat3& linear = to_world.linear;
       const Vec3 along = turn * (linear * (v2 * e1 - v1 * e2));
       const Vec3 across = turn * (linear * (u1 * e2 - u2 * e1));
       const Vec3 t = unit_or(along - dot(along, ns) * ns, {});
@@ -333,11 +390,11 @@ Surface World::surface_at(const Hit& hit, Vec3 d) const {
   return s;
 }
 
-Vec3 World::transmittance(Vec3 o, Vec3 d, float tfar) const {
-  if (!transmits_) return Vec3(occluded(o, d, tfar) ? 0.0f : 1.0f);
+Vec3 World::transmittance(Vec3 o, Vec3 d, float tfar, float time) const {
+  if (!transmits_) return Vec3(occluded(o, d, tfar, time) ? 0.0f : 1.0f);
   Vec3 share(1.0f);
   for (int k = 0; k < 256; ++k) {
-    const Hit hit = intersect(o, d, tfar);
+    const Hit hit = intersect(o, d, tfar, time);
     if (!hit) return share;
     if (!material(hit).transmits) return {};
     const Surface s = surface_at(hit, d);
@@ -351,16 +408,16 @@ Vec3 World::transmittance(Vec3 o, Vec3 d, float tfar) const {
   return {};
 }
 
-World::Emitter World::sample_emitter(Pair u) const {
+World::Emitter World::sample_emitter(Pair u, float time) const {
   const auto pick = emitters_.sample(u.bits);
   const Face at = emissive_[pick.index];
   const float root = std::sqrt(pick.rest);
   Hit hit;
-  hit.instance = at.instance, hit.face = at.face;
+  hit.instance = at.instance, hit.face = at.face, hit.time = time;
   hit.u = root * (1 - u.y), hit.v = root * u.y;
   const Triangles& t = meshes_[instances_[at.instance].mesh].triangles;
   const Vec3 a = t.corner(at.face, 0);
-  const Mat3& normal = instances_[at.instance].normal;
+  const Mat3 normal = moment(instances_[at.instance], time).normal;
   const Vec3 n = unit_or(normal * cross(t.corner(at.face, 1) - a, t.corner(at.face, 2) - a), {});
   const Surface s = surface_at(hit, -n);
   return {s.p, n, s.emission, emitter_density(hit), s.rise};

@@ -39,12 +39,13 @@ class World {
   void add(const DeltaLight& light) { delta_lights_.push_back(light); }
   // Builds the mesh's BVH.
   uint32_t add(const MeshView& mesh);
-  // `matrix`: 12 numbers, the rows of [linear | t], not singular.
-  uint32_t place(uint32_t mesh, const double* matrix);
+  // `matrices`: 12 numbers each, the rows of [linear | t], not singular, at even times while the
+  // shutter is open; one for what stands still. Between them each number runs linearly.
+  uint32_t place(uint32_t mesh, const double* matrices, size_t steps = 1);
   // Once all is there.
   void commit();
   // A new place for an instance: the top level alone is built again.
-  void move(uint32_t instance, const double* matrix);
+  void move(uint32_t instance, const double* matrices, size_t steps = 1);
 
   size_t instances() const { return instances_.size(); }
   size_t triangles() const;
@@ -56,14 +57,15 @@ class World {
   // Spheres around the parts of the instances, in the world.
   std::span<const Sphere> bounds() const { return bounds_; }
 
-  Hit intersect(Vec3 o, Vec3 d, float tfar = kInfinity) const {
-    return chromeball::intersect(top_.get(), o, d, tfar);
+  // `time`: of the shutter's opening, 0..1.
+  Hit intersect(Vec3 o, Vec3 d, float tfar = kInfinity, float time = 0) const {
+    return chromeball::intersect(top_.get(), o, d, tfar, time);
   }
-  bool occluded(Vec3 o, Vec3 d, float tfar = kInfinity) const {
-    return chromeball::occluded(top_.get(), o, d, tfar);
+  bool occluded(Vec3 o, Vec3 d, float tfar = kInfinity, float time = 0) const {
+    return chromeball::occluded(top_.get(), o, d, tfar, time);
   }
   // The share of light that comes straight through from o + tfar d to o.
-  Vec3 transmittance(Vec3 o, Vec3 d, float tfar = kInfinity) const;
+  Vec3 transmittance(Vec3 o, Vec3 d, float tfar = kInfinity, float time = 0) const;
 
   Surface surface_at(const Hit& hit, Vec3 d) const;
   const Material& material(const Hit& hit) const {
@@ -79,7 +81,7 @@ class World {
     float rise;     // how far before the face a ray has to end
   };
   bool shines() const { return !emitters_.empty(); }
-  Emitter sample_emitter(Pair u) const;
+  Emitter sample_emitter(Pair u, float time = 0) const;
   float emitter_density(const Hit& hit) const {  // of that point, 1/m^2
     return material(hit).power * inverse_power_;
   }
@@ -100,18 +102,25 @@ class World {
   struct Instance {
     uint32_t mesh;
     GeometryHandle geometry;
-    Affine to_world;
+    Affine to_world;  // while it stands still, or when the shutter opens
     Mat3 normal;   // inverse transpose, up to a positive factor
     Mat3 size;     // |linear|, for error bounds
     Mat3 spread;   // |linear| |linear^-1|
     Vec3 slack;    // |linear| |linear^-1 t| + |t|
     float scale;   // largest
-    float determinant;
+    std::vector<Affine> steps;  // of what moves; the bounds above hold for all of them
   };
+  // Where an instance is at a time.
+  struct Moment {
+    Affine to_world;
+    Mat3 normal;
+  };
+  static Moment moment(const Instance& instance, float time);
   struct Face {
     uint32_t instance, face;
   };
-  static void set(Instance& instance, const double* matrix);
+  static void set(Instance& instance, const double* matrices, size_t steps);
+  static void set_step(Instance& instance, const double* matrix, uint32_t step);
   void find_bounds();
   void find_emitters();
 

@@ -84,7 +84,8 @@ def world(
 
     for thing in objects:
         instance = thing if isinstance(thing, Instance) else Instance(thing)
-        built.place(mesh(instance.mesh), moved_back(instance.matrix(), about))
+        steps = [moved_back(matrix, about) for matrix in instance.matrices()]
+        built.place(mesh(instance.mesh), np.array(steps))
     for light in lights:
         p = light.position
         built.add_light(
