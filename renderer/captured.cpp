@@ -42,8 +42,15 @@ void Captured::find_planes() {
       for (int k = 0; k < 3; ++k) {
         moved |= !is_zero(stand_in.corner(hit.face, k) - stand_in.original_corner(hit.face, k));
       }
-      const Vec3 n = stand_in.normal(hit.face);
-      planes_[t] = {n, moved ? NAN : dot(n, stand_in.corner(hit.face, 0))};
+      if (!moved) {
+        const Vec3 n = stand_in.normal(hit.face);
+        planes_[t] = {n, dot(n, stand_in.corner(hit.face, 0)), Plane::kStays};
+        continue;
+      }
+      const Vec3 a = stand_in.original_corner(hit.face, 0);
+      const Vec3 n = unit_or(cross(stand_in.original_corner(hit.face, 1) - a,
+                                   stand_in.original_corner(hit.face, 2) - a), {0, 1, 0});
+      planes_[t] = {n, dot(n, a), hit.face};
     }
   });
 }
@@ -137,7 +144,31 @@ Captured::Light Captured::draw(uint32_t k, uint64_t seed) const {
   const float cos = dot(plane.n, s.direction);
   const float z = (plane.offset - dot(plane.n, origin_)) / cos;
   if (!(z > 0 && z < kInfinity)) return {};
-  return {origin_ + z * s.direction, true, plane.n, s.density * std::abs(cos) / (z * z)};
+  const Vec3 q = origin_ + z * s.direction;
+  const float density = s.density * std::abs(cos) / (z * z);
+  if (plane.moved != Plane::kStays) return carried(plane.moved, q, density);
+  return {q, true, plane.n, density};
+}
+
+float Captured::growth(uint32_t face) const {
+  const auto area = [&](auto corner) {
+    return length(cross(corner(1) - corner(0), corner(2) - corner(0)));
+  };
+  const float before = area([&](int k) { return stand_in_.original_corner(face, k); });
+  return area([&](int k) { return stand_in_.corner(face, k); }) / before;
+}
+
+// The light that q, a point of the face as it was captured, has been brought with it.
+Captured::Light Captured::carried(uint32_t face, Vec3 q, float density) const {
+  const Vec3 a = stand_in_.original_corner(face, 0), b = stand_in_.original_corner(face, 1) - a,
+             c = stand_in_.original_corner(face, 2) - a, n = cross(b, c);
+  const float u = dot(cross(q - a, c), n) / length2(n), v = dot(cross(b, q - a), n) / length2(n);
+  const float grown = growth(face);
+  // a neighbour's, which may have gone elsewhere: left to the other strategies
+  if (!(u >= 0 && v >= 0 && u + v <= 1 && grown > 0 && grown < kInfinity)) return {};
+  const Vec3 place = (1 - u - v) * stand_in_.corner(face, 0) + u * stand_in_.corner(face, 1) +
+                     v * stand_in_.corner(face, 2);
+  return {place, true, stand_in_.normal(face), density / grown};
 }
 
 Captured::Sample Captured::sample(Vec3 x, Pair u) const {
@@ -157,14 +188,24 @@ float Captured::density(Vec3 x, Vec3 d, const Place& place) const {
     const bool infinite = planes_.empty() || is_zero(planes_[environment_.texel_of(d)].n);
     return infinite ? environment_.density(d) : 0;
   }
-  const Vec3 from_o = place.p - origin_;
+  const Vec3 from_o = place.captured_at - origin_;
   const float distance = length(from_o);
   if (!(distance > 0)) return 0;
   const Vec3 w = from_o * (1 / distance);
   const Plane& plane = planes_[environment_.texel_of(w)];
-  const float off = dot(plane.n, place.p) - plane.offset;
-  if (is_zero(plane.n) || !(std::abs(off) < 1e-4f * distance + kLift * largest_magnitude(place.p))) return 0;
-  return environment_.density(w) * jacobian(x, place.p, plane.n);
+  const float slack = 1e-4f * distance + kLift * largest_magnitude(place.captured_at);
+  const float off = dot(plane.n, place.captured_at) - plane.offset;
+  if (is_zero(plane.n) || !(std::abs(off) < slack)) return 0;
+  if (plane.moved == Plane::kStays) {
+    if (!(length(place.p - place.captured_at) < slack)) return 0;
+    return environment_.density(w) * jacobian(x, place.p, plane.n);
+  }
+  if (plane.moved != place.face) return 0;
+  const Vec3 to = place.p - x;
+  const float x2 = length2(to), cos_x = std::abs(dot(to, place.n)) / std::sqrt(x2);
+  if (!(cos_x > 1e-6f)) return 0;
+  const float cos_o = std::abs(dot(w, plane.n));
+  return environment_.density(w) * cos_o * x2 / (distance * distance * cos_x * growth(place.face));
 }
 
 }  // namespace chromeball

@@ -114,11 +114,13 @@ class Captured {
   float density(Vec3 x, Vec3 d, const Place& place) const;
 
  private:
-  // The plane that a texel's centre shows: n . q = offset; n = 0 for the infinite environment,
-  // offset NaN where a stand-in was moved from under its light (never sampled).
+  // The plane that a texel's centre showed when the map was captured: n . q = offset; n = 0 for
+  // the infinite environment. Where it has moved since, the face that carries its light.
   struct Plane {
+    static constexpr uint32_t kStays = ~0u;
     Vec3 n;
     float offset = 0;
+    uint32_t moved = kStays;
   };
   // A point of the map, drawn with its density and stratified along the map's Hilbert curve.
   struct Light {
@@ -130,6 +132,8 @@ class Captured {
   static constexpr uint32_t kLights = 8192;
   void find_planes();
   Light draw(uint32_t k, uint64_t seed) const;
+  Light carried(uint32_t face, Vec3 q, float density) const;
+  float growth(uint32_t face) const;  // of a face's area since the map was captured
 
   // d omega_o / d omega_x through the surface element at q with normal n.
   float jacobian(Vec3 x, Vec3 q, Vec3 n) const;

@@ -15,6 +15,7 @@ from chromeball.scene.errors import UserError
 from chromeball.scene.image import read_image, write_exr
 from chromeball.scene.manifest import View
 from chromeball.scene.pose import Pose
+from tests.renderer.asset_files import Gltf, cube, picture
 from tests.renderer.scenes import SCENE, run, write_scene
 
 
@@ -192,3 +193,36 @@ def test_samples_are_steered_inside_a_fisheyes_circle_too(scene: Path) -> None:
     assert 0.5 < seen.mean() < 0.9
     assert counts[seen].mean() == pytest.approx(32, rel=0.02)
     assert counts[seen].std() > 4
+
+
+def test_objects_and_lights_of_all_kinds_from_files(
+    scene: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A textured glTF in several places, an OBJ, an area light and a spot, by the command."""
+    gltf = Gltf()
+    picture(scene.parent / "wood.png", np.full((2, 2, 3), 200, np.uint8))
+    gltf.add("images", {"uri": "wood.png"})
+    gltf.add("textures", {"source": 0})
+    paint = {"baseColorTexture": {"index": 0}, "roughnessFactor": 0.6, "metallicFactor": 0}
+    gltf.node(mesh=gltf.mesh(cube(gltf, pbrMetallicRoughness=paint)))
+    gltf.write(scene.parent / "crate.gltf", "crate.bin")
+    text = (
+        'name = "ball"\nmesh = "crate.gltf"\nscale = 0.4\n'
+        "instances = [{}, { position = [0.8, 0, 0], rotation = [0, 45, 0] }]"
+    )
+    lights = (
+        '[[light]]\nname = "panel"\nkind = "area"\nposition = [-1, 1, 0]\n'
+        "look_at = [0, 0, 0]\nsize = [0.4, 0.4]\nradiance = [9, 9, 9]\n"
+        '[[light]]\nname = "spot"\nkind = "spot"\nposition = [0, 2, 0]\n'
+        "direction = [0, -1, 0]\nangle = 30\nintensity = [2, 2, 2]\n"
+    )
+    whole = SCENE.replace('name = "ball"\nmesh = "sphere"\nscale = 0.5', text) + lights
+    scene.write_text(whole)
+    run("render", scene, "--json")
+    figures = json.loads(capsys.readouterr().out)
+    assert figures["changed_pixels"] > 100
+    record = json.loads((scene.parent / "build/main.exr.record.json").read_text())
+    inputs = {Path(name).name for name in record["inputs"]}
+    assert {"crate.gltf", "crate.bin", "wood.png"} <= inputs
+    with pytest.raises(UserError, match="direct integrator knows no lights"):
+        run("render", scene, "--integrator", "direct")
