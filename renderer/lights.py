@@ -16,6 +16,7 @@ from chromeball.renderer.mesh import Instance, Mesh
 from chromeball.renderer.texture import read_texture
 from chromeball.scene.errors import UserError
 from chromeball.scene.manifest import Light, Scene
+from chromeball.scene.pose import Pose
 
 #: Corners of a disc.
 _SEGMENTS = 64
@@ -64,7 +65,8 @@ def area_lights(scene: Scene, folder: str | os.PathLike[str] = ".") -> list[Inst
     for light in scene.light:
         if light.kind == "area":
             try:
-                found.append(Instance(_area_mesh(light, Path(folder))))
+                place = Pose(np.eye(3), np.array(light.position, float))
+                found.append(Instance(_area_mesh(light, Path(folder)), place))
             except UserError as error:
                 where = "" if error.file is None else f"{error.file}: "
                 raise UserError(f"[[light]] {light.name!r}: {where}{error.what}") from error
@@ -81,6 +83,7 @@ def axis_of(light: Light) -> NDArray[np.float64]:
 
 
 def _area_mesh(light: Light, folder: Path) -> Mesh:
+    """The light about its position."""
     n = axis_of(light)
     up = np.array([0.0, 1.0, 0.0])
     if np.linalg.norm(np.cross(up, n)) < 1e-6:
@@ -106,7 +109,7 @@ def _area_mesh(light: Light, folder: Path) -> Mesh:
         extent = np.array([2.0, 2.0]) * light.radius * grow
     uv = flat / extent + 0.5
     uv[:, 1] = 1 - uv[:, 1]
-    front = np.array(light.position, float) + flat @ np.stack([right, up])
+    front = flat @ np.stack([right, up])
     texture = None
     share = 1.0
     if light.texture is not None:
