@@ -87,6 +87,8 @@ def prepare(scene: Scene, folder: Path, view: View, spp: int) -> Job:
 
     """
     if scene.render.integrator == "ao":
+        if scene.light:
+            raise UserError("ambient occlusion knows no lights: --integrator path does")
         if not (view.bracket or view.plate):
             raise UserError(
                 f"view {view.name!r}: ambient occlusion has no light to show: give it a plate"
@@ -97,10 +99,6 @@ def prepare(scene: Scene, folder: Path, view: View, spp: int) -> Job:
     else:
         captured, inputs = captured_set(scene, folder)
         back = backdrop(scene, folder, view, captured.origin)
-    if scene.light and scene.render.integrator != "path":
-        raise UserError(
-            f"the {scene.render.integrator} integrator knows no lights: --integrator path does"
-        )
     inputs += back.inputs
     inputs += [path for path in scene_inputs(scene, folder) if path.is_file()]
     compositor = Compositor(

@@ -224,5 +224,11 @@ def test_objects_and_lights_of_all_kinds_from_files(
     record = json.loads((scene.parent / "build/main.exr.record.json").read_text())
     inputs = {Path(name).name for name in record["inputs"]}
     assert {"crate.gltf", "crate.bin", "wood.png"} <= inputs
-    with pytest.raises(UserError, match="direct integrator knows no lights"):
-        run("render", scene, "--integrator", "direct")
+    run("render", scene, "--integrator", "direct", "--spp", "16", "-o", scene.parent / "d.exr")
+    bright = [
+        np.mean(read_image(scene.parent / name).pixels[..., :3])
+        for name in ("build/main.exr", "d.exr")
+    ]
+    assert bright[1] == pytest.approx(bright[0], rel=0.1)
+    with pytest.raises(UserError, match="ambient occlusion knows no lights"):
+        run("render", scene, "--integrator", "ao")
