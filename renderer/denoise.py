@@ -7,6 +7,7 @@ detail of the plate stay, and pixels that no object changes keep their bits.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,11 +33,31 @@ def denoise(composite: Composite, plate: NDArray[np.float32]) -> Composite:
         raise UserError(
             "denoising needs the extra: pip install 'chromeball[denoise]'"
         ) from error
+    from scipy.ndimage import distance_transform_edt
+
     changed = composite.changed[..., None]
     if not changed.any():
         return composite
-    kept = np.where(changed, np.maximum(pyoidn.denoise(composite.kept, hdr=True), 0), 1)
-    added = np.where(changed, np.maximum(pyoidn.denoise(composite.added, hdr=True), 0), 0)
+    alpha = composite.alpha[..., None]
+
+    def clean(layer: NDArray[np.float32], share: NDArray[np.float32]) -> NDArray[np.float32]:
+        """A layer that covers `share` of each pixel, by its own colour: outlines stay sharp."""
+        if not layer.any():
+            return layer
+        shown = share[..., 0] > 0.02
+        if not shown.any():
+            return layer
+        own = np.divide(layer, share, out=np.zeros_like(layer), where=shown[..., None])
+        # where it does not show it goes on as beside, so that nothing bleeds in
+        nearest: Any = distance_transform_edt(
+            ~shown, return_distances=False, return_indices=True
+        )
+        own = pyoidn.denoise(np.ascontiguousarray(own[tuple(nearest)]), hdr=True)
+        return np.where(shown[..., None], np.maximum(own, 0) * share, layer)
+
+    rest = clean(composite.added - composite.objects, 1 - alpha)  # light added to the set
+    kept = np.where(changed, clean(composite.kept, 1 - alpha), 1)
+    added = np.where(changed, clean(composite.objects, alpha) + rest, 0)
     kept, added = kept.astype(np.float32), added.astype(np.float32)
     rgb = np.where(changed, np.maximum(plate * kept + added, 0), composite.rgb)
     return replace(composite, rgb=rgb.astype(np.float32), kept=kept, added=added)
