@@ -112,7 +112,9 @@ Vec3 Compositor::object_radiance(Hit hit, Vec3 d, int bounces, Path& path) const
       const float w = other > 0 ? next.density / (next.density + other) : 1;
       return sum + w * beta * stand_in_radiance(place, d, bounces, path);
     }
-    if (next.blurs) --bounces;
+    // what goes through a solid and about in it is no interreflection
+    const bool within = s.transmission > 0 && (dot(d, s.ng) < 0 || !s.outside);
+    if (next.blurs && !within) --bounces;
   }
   return sum;
 }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -144,9 +145,11 @@ def captured_set(scene: Scene, folder: Path) -> tuple[CapturedSet, list[Path]]:
 
 
 def _stand_in(scene: Scene, folder: Path) -> tuple[StandInMesh | None, list[Path]]:
-    if not scene.stand_in:
-        return None, []
     file = folder / scene.folder / "stand_in.ply"
+    if not scene.stand_in:
+        if file.is_file():
+            print(f"{file} is not used: the scene has no [[stand_in]]", file=sys.stderr)
+        return None, []
     return read_stand_in(file), [file]
 
 
@@ -343,7 +346,9 @@ def steady_exposure(job: Job) -> float:
 def _origin(env_file: Path) -> NDArray[np.float64]:
     value = read_image(env_file).attributes.get("origin")
     origin = np.zeros(0) if value is None else np.array(value, float).reshape(-1)
-    if origin.shape != (3,) or not np.isfinite(origin).all():
+    if origin.shape == (3,) and not np.isfinite(origin).all():
+        raise UserError("its attribute `origin` is NaN or infinite", file=env_file)
+    if origin.shape != (3,):
         raise UserError(
             "has no attribute `origin` (x, y, z of the light probe in metres); "
             "make it with `envmap probe`",

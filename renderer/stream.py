@@ -182,8 +182,8 @@ class Session:
         self._lamps = area_lights(self._scene, self.folder)
         #: a compositor for each integrator that was asked for, with the objects it has
         self._compositors: dict[str, tuple[Compositor, list[Object]]] = {}
-        #: the integrators that can be had, the fastest last: direct knows no lights
-        self.integrators: tuple[Light, ...] = ("path",) if self._scene.light else _LIGHT
+        #: the integrators that can be had, the fastest last
+        self.integrators: tuple[Light, ...] = _LIGHT
         self._settings = settings or Settings(integrator=self._scene.render.integrator)
         self._eyes: list[Eye] = []
         self._version = 0
@@ -300,8 +300,6 @@ class Session:
         with self._wake:
             before = self._settings
             after = replace(before, **fields)
-            if after.integrator not in self.integrators:
-                raise UserError("the direct integrator knows no lights: the scene has some")
             self._settings = after
             for eye in self._eyes:
                 eye.done = False

@@ -53,9 +53,9 @@ def render(
         Frames of a sequence: 1-48, 1-48:2 or 7; by default those of the view.
     tile
         Make one tile of the picture: 1/4 is the first of four, 4 all of them. The last one
-        joins them.
+        joins them. Tiles have equally many samples in each pixel, the path integrator's.
     join
-        Join tiles that were made elsewhere.
+        Join tiles that were made elsewhere, with the same --spp.
     force
         Make finished frames and tiles again.
     spp
@@ -85,6 +85,8 @@ def render(
         raise UserError("a sequence has one file a frame; write %04d in its name", file=output)
     if join and tile:
         raise UserError("--join takes the tiles that lie there: leave out --tile")
+    if tile and (integrator or scene.render.integrator) != "path":
+        raise UserError("tiles are for the path integrator: direct makes whole frames")
 
     from chromeball.renderer import frames as jobs
     from chromeball.renderer.render import Budget
@@ -230,8 +232,11 @@ def _line(outcome: Outcome) -> str:
             spread, speed = figures["relative_error"], figures["mrays_per_second"]
             noise = f"{spread:.2%}" if isinstance(spread, float) else "unknown"
             rays = f", {speed:.1f} Mrays/s" if isinstance(speed, float) else ""
+            made = f"{outcome.output}: {figures['spp']} spp in {figures['seconds']:.1f} s{rays}"
+            changed = figures["changed_pixels"]
+            if not changed:
+                return f"{made}, no pixel changed: no object is seen, none touches the light"
             return (
-                f"{outcome.output}: {figures['spp']} spp in {figures['seconds']:.1f} s{rays}, "
-                f"{figures['changed_pixels']} pixels changed, noise {noise} of their mean; "
+                f"{made}, {changed} pixels changed, noise {noise} of their mean; "
                 f"{figures['png']} beside it"
             )

@@ -506,8 +506,8 @@ class Render(Table, frozen=True):
     integrator: Literal["path", "direct", "ao"] = "path"
     denoise: bool = False
     spp: Annotated[int, Meta(ge=1)] = 64
-    seed: int = 0
-    bounces: Annotated[int, Meta(ge=0)] = 2
+    seed: Annotated[int, Meta(ge=0, le=2**62)] = 0
+    bounces: Annotated[int, Meta(ge=0, le=100_000)] = 2
     composite: Literal["quotient", "difference"] = "quotient"
 
 
