@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from chromeball.envmap.kernel import Projection
+from chromeball.scene.camera import CUBE_FACES as FACES
 from chromeball.scene.camera import FISHEYE_MODELS, WORLD_FROM_LATLONG, CameraModel
 from chromeball.scene.errors import UserError
 
@@ -103,17 +104,6 @@ class LatLong(Mapping):
     @override
     def kernel(self) -> Projection:
         return Projection.latlong(*self.size)
-
-
-#: Faces of the cube in camera axes: forward, right, down, and column and row in the cross.
-FACES: tuple[tuple[tuple[int, int, int], ...], ...] = (
-    ((0, 0, 1), (1, 0, 0), (0, 1, 0), (1, 1, 0)),
-    ((1, 0, 0), (0, 0, -1), (0, 1, 0), (2, 1, 0)),
-    ((0, 0, -1), (-1, 0, 0), (0, 1, 0), (3, 1, 0)),
-    ((-1, 0, 0), (0, 0, 1), (0, 1, 0), (0, 1, 0)),
-    ((0, -1, 0), (1, 0, 0), (0, 0, 1), (1, 0, 0)),
-    ((0, 1, 0), (1, 0, 0), (0, 0, -1), (1, 2, 0)),
-)
 
 
 class Cube(Mapping):

@@ -13,6 +13,7 @@ from chromeball.renderer import core
 from chromeball.renderer.mesh import Values
 from chromeball.scene.camera import CameraModel
 from chromeball.scene.errors import UserError
+from chromeball.scene.manifest import View
 from chromeball.scene.pose import Pose
 
 #: Reconstruction filters without negative parts: coverages stay in 0 .. 1, and samples can be
@@ -100,6 +101,8 @@ def quantiles(name: Filter) -> NDArray[np.float32]:
 
 def edge(name: Filter, x: NDArray[np.float64]) -> NDArray[np.float64]:
     """How a step looks through the filter: its cumulative distribution at x pixels."""
+    if name == "box":
+        return np.clip(x + 0.5, 0, 1)
     return np.interp(x, quantiles(name), np.linspace(0, 1, _QUANTILES))
 
 
@@ -108,6 +111,32 @@ def focus_axis(camera: CameraModel) -> NDArray[np.float64] | None:
     names = ("LENSMODEL_OPENCV", "LENSMODEL_CAHVOR", "LENSMODEL_PINHOLE")
     flat = camera.model == "pinhole" or camera.model.startswith(names)
     return camera.world_from_camera.rotation[:, 2] if flat else None
+
+
+def view_lens(
+    view: View, kind: Filter, camera: CameraModel, closing: Pose | None = None
+) -> Lens:
+    """The lens that the scene file gives a view; `closing`: its camera at the shutter's close.
+
+    Raises
+    ------
+    UserError
+        Where it is to focus behind the camera.
+
+    """
+    aperture = view.aperture or 0.0
+    if view.f_number is not None and view.focal_length is not None:
+        aperture = view.focal_length / view.f_number
+    axis, focus = focus_axis(camera), np.inf
+    if view.focus_distance is not None:
+        focus = view.focus_distance
+    elif view.focus_at is not None:
+        to = np.array(view.focus_at, float) - camera.world_from_camera.translation
+        focus = float(np.linalg.norm(to) if axis is None else to @ axis)
+        if not focus > 0:
+            raise UserError(f"view {view.name!r}: focus_at lies behind the camera")
+    motion = None if closing is None else (camera.world_from_camera, closing)
+    return Lens(kind, aperture, focus, axis, motion, view.shutter > 0)
 
 
 def _triple(value: NDArray[np.float64]) -> tuple[float, float, float]:

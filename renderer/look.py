@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ from chromeball.hdr.response_file import Response, read_response
 from chromeball.renderer.composite import Composite
 from chromeball.renderer.exposed import best_frame
 from chromeball.renderer.grain import Noise, grain, measure_noise
+from chromeball.renderer.lens import Filter, edge
 from chromeball.renderer.sharpness import Softness, measure_softness, soften, softening
 from chromeball.scene.camera import CameraModel
 from chromeball.scene.errors import UserError
@@ -52,6 +54,7 @@ class CameraLook:
     """What the camera does to a picture; None or ones where it is left out.
 
     ``falloff`` (H, W) float32: vignetting, 1 at the centre. ``seed``: of the noise, 0 or more.
+    ``filter``: that the synthetic part was sampled with, so far its only softness.
     """
 
     noise: Noise | None = None
@@ -59,6 +62,7 @@ class CameraLook:
     falloff: NDArray[np.float32] | None = None
     exposed: Exposed | None = None
     seed: int = 0
+    filter: Filter = "box"
 
     def figures(self) -> dict[str, Json]:
         """What was measured on the plate, for the record."""
@@ -122,7 +126,8 @@ def read_look(
             inputs.append(folder / scene.folder / "response.json")
         exposed = _exposed(look, read_response(inputs[-1]), plate_file, plate)
     seed = scene.render.seed % 2**64  # as the core takes it
-    return CameraLook(noise, softness, falloff, exposed, seed), tuple(inputs)
+    found = CameraLook(noise, softness, falloff, exposed, seed, scene.render.filter)
+    return found, tuple(inputs)
 
 
 def _exposed(
@@ -184,7 +189,8 @@ def apply_look(
     k, synthetic = composite.kept, composite.added
     figures: dict[str, Json] = {}
     if look.softness is not None:
-        kernels = [softening(float(width)) for width in look.softness.width]
+        seen = partial(edge, look.filter)
+        kernels = [softening(float(width), seen) for width in look.softness.width]
         k, synthetic = 1 + _soften(k - 1, kernels), _soften(synthetic, kernels)
     if look.falloff is not None:
         synthetic = synthetic * look.falloff[..., None]

@@ -7,7 +7,7 @@ import os
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -17,10 +17,12 @@ from chromeball.renderer.composite import CapturedSet, Composite, Compositor, ev
 from chromeball.renderer.denoise import denoise
 from chromeball.renderer.exposed import expose
 from chromeball.renderer.inputs import scene_inputs
+from chromeball.renderer.lens import view_lens
 from chromeball.renderer.lights import area_lights, delta_lights
 from chromeball.renderer.look import CameraLook, apply_look, read_look
 from chromeball.renderer.path import corner_rays
-from chromeball.renderer.scene import object_instances, turn
+from chromeball.renderer.scene import moving_instances, turn
+from chromeball.renderer.travel import unseen
 from chromeball.scene.camera import WORLD_FROM_LATLONG, CameraModel
 from chromeball.scene.color import luminance
 from chromeball.scene.errors import UserError
@@ -28,6 +30,7 @@ from chromeball.scene.image import read_image, read_rgb, to_display, write_exr, 
 from chromeball.scene.manifest import Look, Scene, View
 from chromeball.scene.pose import Pose
 from chromeball.scene.record import Stage, check_output
+from chromeball.scene.sequence import view_at
 from chromeball.stand_in.ply import StandInMesh, read_stand_in
 
 #: Told after each pass: samples a pixel and, where it is known, the relative error so far.
@@ -74,6 +77,7 @@ class Job:
     inputs: tuple[Path, ...]
     look: CameraLook
     denoise: bool = False
+    travel: dict[str, float] = field(default_factory=dict[str, float])
 
 
 def prepare(scene: Scene, folder: Path, view: View, spp: int) -> Job:
@@ -104,7 +108,7 @@ def prepare(scene: Scene, folder: Path, view: View, spp: int) -> Job:
     inputs += [path for path in scene_inputs(scene, folder) if path.is_file()]
     compositor = Compositor(
         [
-            *(thing for things in object_instances(scene, folder) for thing in things),
+            *moving_instances(scene, folder, view.shutter),
             *area_lights(scene, folder),
         ],
         captured,
@@ -117,6 +121,7 @@ def prepare(scene: Scene, folder: Path, view: View, spp: int) -> Job:
         seed=scene.render.seed,
         samples=spp,
         lights=delta_lights(scene),
+        lens=view_lens(view, scene.render.filter, back.camera, back.closing),
     )
     camera, plate_file = back.camera, back.inputs[0] if back.inputs else None
     look, read = read_look(view.look, scene, folder, plate_file, compositor.plate, camera)
@@ -130,7 +135,17 @@ def prepare(scene: Scene, folder: Path, view: View, spp: int) -> Job:
         tuple(inputs),
         look,
         scene.render.denoise,
+        {} if back.plate is not None else _travel(captured, camera),
     )
+
+
+def _travel(captured: CapturedSet, camera: CameraModel) -> dict[str, float]:
+    """How far a camera without a plate is from the probe, and what the probe did not see."""
+    way = camera.world_from_camera.translation - captured.origin
+    return {
+        "metres_from_probe": float(np.linalg.norm(way)),
+        "unseen_by_probe": float(unseen(captured, camera).mean()),
+    }
 
 
 def captured_set(scene: Scene, folder: Path) -> tuple[CapturedSet, list[Path]]:
@@ -155,17 +170,25 @@ def _stand_in(scene: Scene, folder: Path) -> tuple[StandInMesh | None, list[Path
 
 @dataclass(frozen=True)
 class Backdrop:
-    """A view's camera, its photograph (H, W, 3) if it has one, the files they came from."""
+    """A view's camera, its photograph (H, W, 3) if it has one, the files they came from.
+
+    ``closing``: the camera's pose when the shutter closes, if it moves while that is open.
+    """
 
     camera: CameraModel
     plate: NDArray[np.float32] | None = None
     inputs: tuple[Path, ...] = ()
+    closing: Pose | None = None
 
 
 def backdrop(scene: Scene, folder: Path, view: View, origin: NDArray[np.float64]) -> Backdrop:
     """What a view sees before anything is put into it; `origin` (3,) is the probe's place."""
     if not (view.bracket or view.plate):
-        return Backdrop(virtual_camera(view, origin))
+        closing = None
+        if view.key and view.shutter:
+            later = virtual_camera(view_at(view, view.shutter), origin)
+            closing = later.world_from_camera
+        return Backdrop(virtual_camera(view, origin), closing=closing)
     build = folder / scene.folder
     plate_file = build / f"{view.bracket}.exr" if view.bracket else folder / str(view.plate)
     # posed by four points, or a file that holds the pose
@@ -180,25 +203,28 @@ def backdrop(scene: Scene, folder: Path, view: View, origin: NDArray[np.float64]
             f"{plate.shape[1]} x {plate.shape[0]}",
             file=camera_file,
         )
-    return Backdrop(camera, plate, (plate_file, camera_file))
+    if view.closing_camera is None:
+        return Backdrop(camera, plate, (plate_file, camera_file))
+    closing_file = folder / view.closing_camera
+    closing = CameraModel.read(closing_file).world_from_camera
+    return Backdrop(camera, plate, (plate_file, camera_file, closing_file), closing)
 
 
 def virtual_camera(view: View, origin: NDArray[np.float64]) -> CameraModel:
     """The camera of a view without a plate: at its position or the map's origin, turned.
 
-    A ``latlong`` view that is not turned keeps the world's axes, as env.exr.
+    A ``latlong`` or ``cube`` view that is not turned keeps the world's axes, as env.exr.
     """
     place = origin if view.position is None else np.array(view.position, float)
+    panorama = {"latlong": CameraModel.latlong, "cube": CameraModel.cube}.get(view.model)
     if view.rotation is not None:
         turned = turn(view.rotation)
-        if view.model == "latlong":
-            return CameraModel.latlong(
-                view.size, Pose(turned @ WORLD_FROM_LATLONG.rotation, place)
-            )
+        if panorama is not None:
+            return panorama(view.size, Pose(turned @ WORLD_FROM_LATLONG.rotation, place))
         # it looks along -z with +y up; camera axes are y down, z forward
         pose = Pose(turned @ np.diag([1.0, -1.0, -1.0]), place)
-    elif view.model == "latlong":
-        return CameraModel.latlong(view.size, Pose(WORLD_FROM_LATLONG.rotation, place))
+    elif panorama is not None:
+        return panorama(view.size, Pose(WORLD_FROM_LATLONG.rotation, place))
     else:
         pose = _looking_at(view, place)
     fov = math.radians(view.fov)
@@ -310,6 +336,7 @@ def write_composite(stage: Stage, job: Job, composite: Composite, target: Path) 
         "exposure": exposure,
         "png": png.name,
         "look": job.look.figures() | added,
+        **job.travel,
     }
     with stage.output(target) as temporary:
         _write_layers(temporary, composite)

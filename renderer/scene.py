@@ -20,6 +20,7 @@ from chromeball.scene import manifest
 from chromeball.scene.errors import UserError
 from chromeball.scene.manifest import Object, Scene, Vector
 from chromeball.scene.pose import Pose
+from chromeball.scene.sequence import object_at
 
 
 def object_meshes(scene: Scene, folder: str | os.PathLike[str] = ".") -> list[Mesh]:
@@ -51,6 +52,35 @@ def object_instances(
         except UserError as error:
             where = "" if error.file is None else f"{error.file}: "
             raise UserError(f"[[object]] {entry.name!r}: {where}{error.what}") from error
+    return found
+
+
+def moving_instances(
+    scene: Scene, folder: str | os.PathLike[str], shutter: float
+) -> list[Instance]:
+    """As :func:`object_instances`, one after another; with keys they move until `shutter`.
+
+    Raises
+    ------
+    UserError
+        As :func:`object_instances`; where an object with ``instances`` moves.
+
+    """
+    found: list[Instance] = []
+    for entry, instances in zip(scene.object, object_instances(scene, folder), strict=True):
+        later = object_at(entry, shutter)
+        place = (later.position, later.rotation, later.scale)
+        stays = place == (entry.position, entry.rotation, entry.scale)
+        if stays or not (shutter and entry.key):
+            found += instances
+            continue
+        if entry.instances:
+            raise UserError(
+                f"[[object]] {entry.name!r}: what has instances cannot move while the shutter "
+                "is open: write them as objects"
+            )
+        closing = pose_of(later), later.scale
+        found += [replace(instance, closing=closing) for instance in instances]
     return found
 
 

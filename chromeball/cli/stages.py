@@ -664,6 +664,8 @@ class _Planner:
             inputs.append(f"{self.build}/{view.name}.cameramodel")
         elif view.camera:
             inputs.append(view.camera)
+        if view.closing_camera:
+            inputs.append(view.closing_camera)
         inputs += [os.path.relpath(path, self.root) for path in scene_inputs(scene, self.root)]
         picture = f"{self.build}/{picture}"
         stem = picture.removesuffix(".exr")

@@ -50,7 +50,17 @@ _FISHEYE: dict[str, tuple[Radial, Radial, Radial, float]] = {
     ),
 }
 FISHEYE_MODELS = (*_FISHEYE, "kb4")
-MODELS = ("pinhole", *FISHEYE_MODELS, "latlong")
+MODELS = ("pinhole", *FISHEYE_MODELS, "latlong", "cube")
+
+#: Faces of the cube in camera axes: forward, right, down, and column and row in the cross.
+CUBE_FACES: tuple[tuple[tuple[int, int, int], ...], ...] = (
+    ((0, 0, 1), (1, 0, 0), (0, 1, 0), (1, 1, 0)),
+    ((1, 0, 0), (0, 0, -1), (0, 1, 0), (2, 1, 0)),
+    ((0, 0, -1), (-1, 0, 0), (0, 1, 0), (3, 1, 0)),
+    ((-1, 0, 0), (0, 0, 1), (0, 1, 0), (0, 1, 0)),
+    ((0, -1, 0), (1, 0, 0), (0, 0, 1), (1, 0, 0)),
+    ((0, 1, 0), (1, 0, 0), (0, 0, -1), (1, 2, 0)),
+)
 
 
 @dataclass(frozen=True)
@@ -60,8 +70,9 @@ class CameraModel:
     ``model``
         ``pinhole`` (fx fy cx cy); ``equidistant``, ``equisolid``, ``stereographic``,
         ``orthographic`` (f cx cy); ``kb4``, Kannala and Brandt 2006 (fx fy cx cy k1 k2 k3 k4,
-        r = theta + k1 theta^3 + ...); ``latlong`` (none); or one of mrcal's names,
-        ``LENSMODEL_...``, with mrcal's intrinsics.
+        r = theta + k1 theta^3 + ...); ``latlong`` and ``cube`` (none): a cube is a horizontal
+        cross, 4:3, forward in its second column and the back in the last, up and down about
+        forward; or one of mrcal's names, ``LENSMODEL_...``, with mrcal's intrinsics.
     ``size``
         Width and height in pixels.
     ``max_angle``
@@ -85,13 +96,19 @@ class CameraModel:
             except (RuntimeError, TypeError) as error:
                 raise UserError(f"mrcal knows no lens model {self.model!r}") from error
         elif self.model in MODELS:
-            expected = {"pinhole": 4, "kb4": 8, "latlong": 0}.get(self.model, 3)
+            expected = {"pinhole": 4, "kb4": 8, "latlong": 0, "cube": 0}.get(self.model, 3)
         else:
             raise UserError(f"unknown camera model {self.model!r}; one of {', '.join(MODELS)}")
         if len(values) != expected:
             raise UserError(f"{self.model} has {expected} intrinsics, not {len(values)}")
         if not np.isfinite(values).all() or min(self.size) < 1:
             raise UserError(f"{self.model}: intrinsics and size must be finite and positive")
+        width, height = self.size
+        if self.model == "cube" and (3 * width != 4 * height or width % 4):
+            raise UserError(
+                f"a cube is a cross of 4 x 3 faces: {width} x {height} pixels are none; "
+                f"take {max(4, width // 4 * 4)} x {max(3, width // 4 * 3)}"
+            )
 
     # ---- constructors
 
@@ -130,6 +147,11 @@ class CameraModel:
         """A panorama; without a pose its axes are OpenEXR's in world space."""
         return cls("latlong", np.zeros(0), size, pose or WORLD_FROM_LATLONG)
 
+    @classmethod
+    def cube(cls, size: tuple[int, int], pose: Pose | None = None) -> CameraModel:
+        """The six faces of a cube as a cross; without a pose its axes are a panorama's."""
+        return cls("cube", np.zeros(0), size, pose or WORLD_FROM_LATLONG)
+
     def posed(self, world_from_camera: Pose) -> CameraModel:
         """The same camera elsewhere."""
         return replace(self, world_from_camera=world_from_camera)
@@ -155,7 +177,9 @@ class CameraModel:
                 behind = p[..., 2] <= 0
                 q[behind], dq_dp[behind] = np.nan, np.nan
             return q, dq_dp
-        project = self._project_latlong if self.model == "latlong" else self._project_fisheye
+        project = {"latlong": self._project_latlong, "cube": self._project_cube}.get(
+            self.model, self._project_fisheye
+        )
         with np.errstate(divide="ignore", invalid="ignore"):
             q, dq_dp = project(p.reshape(-1, 3))
         return q.reshape(*p.shape[:-1], 2), dq_dp.reshape(*p.shape[:-1], 2, 3)
@@ -178,6 +202,8 @@ class CameraModel:
             return np.stack(
                 [np.sin(lon) * np.cos(lat), np.sin(lat), np.cos(lon) * np.cos(lat)], axis=-1
             )
+        if self.model == "cube":
+            return self._unproject_cube(q)
         fx, fy, cx, cy, _ = self._fisheye_parameters()
         x, y = ((q.reshape(-1, 2) - [cx, cy]) / [fx, fy]).T
         r = np.hypot(x, y)
@@ -207,7 +233,7 @@ class CameraModel:
         """The same lens on a sensor with `factor` times as many pixels a side."""
         size = (round(self.size[0] * factor), round(self.size[1] * factor))
         values = self.intrinsics.copy()
-        if self.model != "latlong":
+        if self.model not in ("latlong", "cube"):
             focal = 1 if self.model in _FISHEYE else 2
             sx, sy = size[0] / self.size[0], size[1] / self.size[1]
             values[:focal] *= [sx] if focal == 1 else [sx, sy]
@@ -376,6 +402,34 @@ class CameraModel:
         dv = dv / norm2[..., None] * (height / math.pi)
         q[norm2 == 0] = np.nan
         return q, np.stack([du, dv], axis=-2)
+
+    def _unproject_cube(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+        q = (pixels + 0.5) / (self.size[0] // 4)
+        d = np.full((*q.shape[:-1], 3), np.nan)
+        for forward, right, down, (column, row, _) in CUBE_FACES:
+            a, b = 2 * (q[..., 0] - column) - 1, 2 * (q[..., 1] - row) - 1
+            here = (np.abs(a) <= 1) & (np.abs(b) <= 1)  # edges are common to two faces
+            v = np.array(forward) + a[here, None] * np.array(right)
+            v = v + b[here, None] * np.array(down)
+            d[here] = v / np.linalg.norm(v, axis=-1, keepdims=True)
+        return d
+
+    def _project_cube(
+        self, p: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        n = self.size[0] // 4
+        q, jacobian = np.full((len(p), 2), np.nan), np.full((len(p), 2, 3), np.nan)
+        best = np.zeros(len(p))
+        for forward, right, down, (column, row, _) in CUBE_FACES:
+            w = p @ np.array(forward, float)
+            here = w > best
+            best = np.where(here, w, best)
+            for axis, (side, first) in enumerate(((right, column), (down, row))):
+                a = (p @ np.array(side, float)) / w
+                slope = (np.array(side) - a[:, None] * np.array(forward)) / w[:, None]
+                q[here, axis] = ((first + (a + 1) / 2) * n - 0.5)[here]
+                jacobian[here, axis] = (slope * n / 2)[here]
+        return q, jacobian
 
 
 def _sees_behind(lensmodel: str) -> bool:

@@ -463,6 +463,12 @@ class View(Table, frozen=True):
 
     A sequence has ``frames`` ("1-48", "1-48:2", "7"), and ``plate`` and ``camera`` may hold
     the frame's number (``plates/%04d.exr``); ``key`` moves a virtual camera as an object's.
+
+    ``aperture``, the lens's diameter in metres, or ``f_number`` and ``focal_length`` (metres)
+    blur what is out of focus: ``focus_distance`` in metres or ``focus_at``, a point.
+    ``shutter`` is the share of a frame for which it is open: what has keys moves meanwhile, and
+    the camera, by its keys or to the pose in ``closing_camera``, a file. A photograph is taken
+    to be blurred already. ``cube`` is a horizontal cross of six faces, 4:3.
     """
 
     name: Name
@@ -471,7 +477,13 @@ class View(Table, frozen=True):
     camera: str | None = None
     points: Quad | None = None
     model: Literal[
-        "pinhole", "equidistant", "equisolid", "stereographic", "orthographic", "latlong"
+        "pinhole",
+        "equidistant",
+        "equisolid",
+        "stereographic",
+        "orthographic",
+        "latlong",
+        "cube",
     ] = "pinhole"
     size: tuple[Annotated[int, Meta(ge=1)], Annotated[int, Meta(ge=1)]] = (640, 480)
     fov: Annotated[float, Meta(gt=0, le=360)] = 60.0
@@ -483,6 +495,13 @@ class View(Table, frozen=True):
     key: list[ViewKey] = []
     interpolation: Literal["linear", "cubic"] = "linear"
     look: Look = Look()
+    aperture: Positive | None = None
+    f_number: Positive | None = None
+    focal_length: Positive | None = None
+    focus_distance: Positive | None = None
+    focus_at: Vector | None = None
+    shutter: Annotated[float, Meta(ge=0, le=1)] = 0.0
+    closing_camera: str | None = None
 
 
 class Calibrate(Table, frozen=True):
@@ -500,7 +519,10 @@ class Render(Table, frozen=True):
     ``integrator``: ``path`` is the reference, all light between objects and set (``bounces``);
     ``direct`` the fast one: light of the set on the objects and their shadows; ``ao`` the same
     under an even white sky, for a plate without a light probe. ``denoise``: Open Image Denoise
-    smooths what is kept of the plate and what is added to it, not the plate.
+    smooths what is kept of the plate and what is added to it, not the plate. ``filter``: how
+    ``path`` weighs what is synthetic about a pixel's middle: ``box``, the pixel's area as a
+    sensor's, ``gaussian`` (deviation half a pixel) or ``blackman-harris`` (3 pixels wide). The
+    plate is not filtered.
     """
 
     integrator: Literal["path", "direct", "ao"] = "path"
@@ -509,6 +531,7 @@ class Render(Table, frozen=True):
     seed: Annotated[int, Meta(ge=0, le=2**62)] = 0
     bounces: Annotated[int, Meta(ge=0, le=100_000)] = 2
     composite: Literal["quotient", "difference"] = "quotient"
+    filter: Literal["box", "gaussian", "blackman-harris"] = "box"
 
 
 class Truth(Table, frozen=True):
@@ -637,7 +660,7 @@ def _check_view(view: View) -> None:
     name = f"view {view.name!r}"
     if view.frames is not None:
         parse_frames(view.frames)
-    for value in (view.plate, view.camera):
+    for value in (view.plate, view.camera, view.closing_camera):
         if value and len(re.findall(r"%0?\d*d", value)) > 1:
             raise UserError(f"{name}: {value!r} holds more than one number")
     moved = view.position is not None or view.rotation is not None or bool(view.key)
@@ -652,9 +675,29 @@ def _check_view(view: View) -> None:
             raise UserError(f"{name}: fov at frame {key.frame:g} is not between 0 and 360")
         if key.rotation is not None and key.look_at is not None:
             raise UserError(f"{name}: a key has look_at or rotation, not both")
+    _check_lens(view, name)
     turned = view.rotation is not None or any(key.rotation is not None for key in view.key)
     if turned and any(key.look_at is not None for key in view.key):
         raise UserError(f"{name} has keys of look_at and a rotation; keep one of the two")
+
+
+def _check_lens(view: View, name: str) -> None:
+    stop = (view.f_number, view.focal_length)
+    if (None in stop) != (stop == (None, None)):
+        raise UserError(f"{name}: f_number and focal_length tell the aperture together")
+    if view.aperture is not None and view.f_number is not None:
+        raise UserError(f"{name} has an aperture and an f_number; keep one")
+    wide = view.aperture is not None or view.f_number is not None
+    focused = (view.focus_distance is not None) + (view.focus_at is not None)
+    if wide and focused != 1:
+        raise UserError(f"{name}: an aperture needs focus_distance or focus_at, one of them")
+    if focused and not wide:
+        raise UserError(f"{name}: without an aperture all is in focus; give one, or no focus")
+    if view.closing_camera is not None and not (view.shutter and (view.bracket or view.plate)):
+        raise UserError(
+            f"{name}: closing_camera is where a photograph's camera is when its shutter "
+            "closes: it needs a plate and a shutter"
+        )
 
 
 _NONE = (None, None, None)

@@ -19,7 +19,15 @@ from typing import Any, Literal
 import msgspec
 
 from chromeball.scene.errors import UserError
-from chromeball.scene.manifest import Object, Scene, Vector, View, parse_frames
+from chromeball.scene.manifest import (
+    Object,
+    ObjectKey,
+    Scene,
+    Vector,
+    View,
+    ViewKey,
+    parse_frames,
+)
 
 type Interpolation = Literal["linear", "cubic"]
 
@@ -43,17 +51,25 @@ def frames_of(view: View) -> list[int]:
 
 
 def at(scene: Scene, frame: int) -> Scene:
-    """The scene at a frame, without keys: a still of its own.
+    """The scene at a frame: a still of its own, whose keys are those of an open shutter.
 
     Numbered files are named; the seed is the scene's plus the frame's number, so that the
     noise of frames is independent.
     """
     still = posed(scene, frame)
+    shutters = sorted({view.shutter for view in scene.view} - {0.0})
+    if shutters:  # what moves while a shutter is open keeps keys, counted from the frame
+        still = msgspec.structs.replace(
+            still,
+            object=[_held(entry, frame, shutters) for entry in scene.object],
+            view=[_held_view(view, frame) for view in scene.view],
+        )
     views = [
         msgspec.structs.replace(
             view,
             plate=numbered(view.plate, frame),
             camera=numbered(view.camera, frame),
+            closing_camera=numbered(view.closing_camera, frame),
             frames=None,
         )
         for view in still.view
@@ -109,6 +125,38 @@ def view_at(view: View, time: int | float) -> View:
     )
 
 
+def _held(entry: Object, frame: int, shutters: Sequence[float]) -> Object:
+    """The object at a frame, with keys at 0 and where shutters close."""
+    now = object_at(entry, frame)
+    if not entry.key:
+        return now
+    later = [(t, object_at(entry, frame + t)) for t in (0.0, *shutters)]
+    keys = [
+        ObjectKey(frame=t, position=o.position, rotation=o.rotation, scale=o.scale)
+        for t, o in later
+    ]
+    return msgspec.structs.replace(now, key=keys, interpolation="linear")
+
+
+def _held_view(view: View, frame: int) -> View:
+    """The view at a frame, with keys at 0 and where its shutter closes."""
+    now = view_at(view, frame)
+    if not view.key or not view.shutter:
+        return now
+    later = [(t, view_at(view, frame + t)) for t in (0.0, view.shutter)]
+    keys = [
+        ViewKey(
+            frame=t,
+            position=v.position,
+            look_at=None if v.rotation else v.look_at,
+            rotation=v.rotation,
+            fov=v.fov,
+        )
+        for t, v in later
+    ]
+    return msgspec.structs.replace(now, key=keys, interpolation="linear")
+
+
 def numbered(name: str | None, frame: int) -> str | None:
     """The file's name with the frame's number in it: ``plates/%04d.exr``."""
     return name and _NUMBER.sub(lambda found: found[0] % frame, name)
@@ -130,7 +178,11 @@ def missing_plates(view: View, frames: Sequence[int], folder: Path) -> None:
         That names the first frame whose plate or camera is not there.
 
     """
-    for what, name in (("plate", view.plate), ("camera", view.camera)):
+    for what, name in (
+        ("plate", view.plate),
+        ("camera", view.camera),
+        ("camera at the shutter's close", view.closing_camera),
+    ):
         if not name or not _NUMBER.search(name):
             continue
         gone = [n for n in frames if not (folder / str(numbered(name, n))).is_file()]
