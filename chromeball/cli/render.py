@@ -29,6 +29,7 @@ def render(
     tile: str | None = None,
     join: Annotated[bool, Parameter(negative="")] = False,
     force: Annotated[bool, Parameter(negative="")] = False,
+    scheduler: str | None = None,
     spp: int | None = None,
     seconds: float | None = None,
     error: float | None = None,
@@ -58,6 +59,9 @@ def render(
         Join tiles that were made elsewhere, with the same --spp.
     force
         Make finished frames and tiles again.
+    scheduler
+        Have the workers of a dask scheduler make them, tcp://host:8786; they see the scene's
+        folder under the same path.
     spp
         Samples a pixel.
     seconds
@@ -83,6 +87,8 @@ def render(
     sequence = [number for number in numbers if number is not None]
     if sequence and output is not None and "%" not in output.name:
         raise UserError("a sequence has one file a frame; write %04d in its name", file=output)
+    if join and scheduler:
+        raise UserError("--join is done here: leave out --scheduler")
     if join and tile:
         raise UserError("--join takes the tiles that lie there: leave out --tile")
     if tile and (integrator or scene.render.integrator) != "path":
@@ -92,6 +98,9 @@ def render(
     from chromeball.renderer.render import Budget
 
     budget = Budget(spp, seconds, error)
+    if scheduler is not None:  # workers stand elsewhere
+        scene_file = scene_file.resolve()
+        output = output and output.resolve()
     parts = [None] if tile is None else jobs.Tile.parse(tile)
     tasks = [
         jobs.Task(
@@ -110,8 +119,12 @@ def render(
     if not join:
         missing_plates(chosen, sequence, scene_file.parent)
     total = spp if spp is not None else scene.render.spp if budget == Budget() else None
-    outcomes = map(jobs.join, tasks) if join else _locally(tasks, force, total)
-    _report(list(outcomes), as_json=json_)
+    if scheduler is not None:
+        outcomes = _elsewhere(tasks, scheduler, force)
+    else:
+        outcomes = map(jobs.join, tasks) if join else _locally(tasks, force, total)
+    order = {task: k for k, task in enumerate(tasks)}
+    _report(sorted(outcomes, key=lambda outcome: order[outcome.task]), as_json=json_)
 
 
 def _view(scene: Scene, scene_file: Path, name: str | None) -> View:
@@ -158,6 +171,24 @@ def _locally(tasks: Sequence[Task], force: bool, total: int | None) -> Iterator[
                 if len(tasks) == 1:
                     raise
                 yield Outcome(task, "failed", error=str(error))
+
+
+def _elsewhere(tasks: Sequence[Task], scheduler: str, force: bool) -> Iterator[Outcome]:
+    """Have the workers of a scheduler make the tasks; how many are done is shown."""
+    from rich.console import Console
+    from rich.progress import track
+
+    from chromeball.renderer.farm import farm_out
+
+    outcomes = farm_out(tasks, scheduler, force=force)
+    yield from track(
+        outcomes,
+        f"render at {scheduler}",
+        len(tasks),
+        console=Console(stderr=True),
+        transient=True,
+        disable=not sys.stderr.isatty(),
+    )
 
 
 @contextmanager
