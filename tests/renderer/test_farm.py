@@ -58,10 +58,9 @@ class Farm:
         self._processes.append(process)
         return process
 
-    def worker(self) -> subprocess.Popen[bytes]:
-        return self._start(
-            "dask_worker", "--no-nanny", "--nthreads", "1", "--host", "127.0.0.1"
-        )
+    def worker(self, name: str) -> subprocess.Popen[bytes]:
+        alone = ("--no-nanny", "--nthreads", "1", "--host", "127.0.0.1")
+        return self._start("dask_worker", "--name", name, *alone)
 
     def stop(self) -> None:
         for process in self._processes[::-1]:
