@@ -169,7 +169,12 @@ def test_only_this_machine_is_served(viewer: Viewer) -> None:
 def test_the_command_says_where_and_ends_with_control_c(tmp_path: Path) -> None:
     import signal
 
-    command = [sys.executable, "-c", "from chromeball.cli.main import main; main()", "view"]
+    # where the tests run in the background, the shell has turned SIGINT off for children
+    program = (
+        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "from chromeball.cli.main import main; main()"
+    )
+    command = [sys.executable, "-c", program, "view"]
     with subprocess.Popen(
         [*command, str(write_scene(tmp_path)), "--port", "0"],
         stdout=subprocess.PIPE,
@@ -179,7 +184,11 @@ def test_the_command_says_where_and_ends_with_control_c(tmp_path: Path) -> None:
         assert process.stdout is not None
         assert process.stdout.readline().startswith("http://127.0.0.1:")
         process.send_signal(signal.SIGINT)
-        _, complaints = process.communicate(timeout=60)
+        try:
+            _, complaints = process.communicate(timeout=60)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            raise
     assert (process.returncode, complaints) == (0, "")
 
 
