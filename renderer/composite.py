@@ -288,6 +288,10 @@ class Compositor:
         self._add(counts)
         self.samples += samples
 
+    def counts_all_noise(self) -> bool:
+        """Whether ``standard_error`` holds all noise; direct's knows its shadow rays alone."""
+        return self._direct is None
+
     def film(self) -> NDArray[np.float32]:
         """What the passes have added up, (H, W, C), a row of sums a pixel; see `restore`."""
         return self._film.copy()

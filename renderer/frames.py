@@ -230,8 +230,8 @@ class _Picture:
     def render(self, progress: Progress | None) -> Outcome:
         job = self.prepare()
         with self.stage("render", job) as stage:
-            composite = accumulate(job.compositor, self.budget, progress)
-            write_composite(stage, job, composite, self.target)
+            composite, error = accumulate(job.compositor, self.budget, progress)
+            write_composite(stage, job, composite, error, self.target)
         return Outcome(self.task, "rendered", os.fspath(self.target), dict(stage.figures))
 
     # ---- tiles
@@ -312,7 +312,9 @@ class _Picture:
             film[rows] = image.pixels
         with self.stage("render", job) as stage:
             job.compositor.restore(film, spp)
-            write_composite(stage, job, job.compositor.result(), self.target)
+            composite = job.compositor.result()
+            error = composite.relative_error() if spp > 1 else None
+            write_composite(stage, job, composite, error, self.target)
             stage.figures["tiles"] = len(self.tiles())
             # what the samples took, not what joining them took
             stage.figures["seconds"] = sum(

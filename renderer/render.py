@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chromeball.renderer.composite import CapturedSet, Composite, Compositor, even_light
+from chromeball.renderer.converge import Convergence
 from chromeball.renderer.denoise import denoise
 from chromeball.renderer.exposed import expose
 from chromeball.renderer.inputs import scene_inputs
@@ -258,8 +259,12 @@ def accumulate(
     compositor: Compositor,
     budget: Budget,
     progress: Progress | None = None,
-) -> Composite:
-    """Passes until the budget is reached; the error is only known where it is asked for."""
+) -> tuple[Composite, float | None]:
+    """Passes until the budget is reached; the composite and its relative error, if known.
+
+    `progress` is told the error where the budget asks for one.
+    """
+    converging = Convergence(compositor.counts_all_noise())
     start = time.perf_counter()
     seconds = 0.0
     while True:
@@ -269,13 +274,17 @@ def accumulate(
             left = max(1, min(left, int(speed * (budget.seconds - seconds))))
         compositor.refine(left)
         seconds = time.perf_counter() - start
-        error = None
-        if budget.error is not None and compositor.samples >= 2 * PASS:
-            error = compositor.result().relative_error()
+        error, samples = None, compositor.samples
+        # path's error is known at any time, direct's follows from all doublings on the way
+        asked = budget.error is not None and samples >= converging.least()
+        if (asked or not compositor.counts_all_noise()) and converging.is_due(samples):
+            error = converging.error(compositor.result(), samples)
+            error = error if asked else None
         if progress is not None:
-            progress(compositor.samples, error)
-        if budget.reached(compositor.samples, seconds, error):
-            return compositor.result()
+            progress(samples, error)
+        if budget.reached(samples, seconds, error):
+            composite = compositor.result()
+            return composite, converging.error(composite, samples)
 
 
 def check_target(output: str | os.PathLike[str], look: Look | None = None) -> Path:
@@ -301,15 +310,17 @@ def expected_samples(budget: Budget) -> int:
     return budget.spp if budget.spp is not None and budget.spp < 4096 else 256
 
 
-def write_composite(stage: Stage, job: Job, composite: Composite, target: Path) -> None:
+def write_composite(
+    stage: Stage, job: Job, composite: Composite, error: float | None, target: Path
+) -> None:
     """Write the EXR with its layers and the PNG as outputs of `stage`, and its figures.
 
+    `error`: relative, of the changed pixels, None where it is not known.
     Where the view's look asks for it, VIEW.camera.png and .jpg too: the plate camera's codes.
 
     The EXR holds R G B A, ``quotient.R G B``, ``objects.R G B`` (premultiplied),
     ``error.Y`` (standard error of the brightness) and ``depth.Z`` in metres.
     """
-    relative_error = composite.relative_error()
     if job.denoise:
         composite = denoise(composite, job.compositor.plate)
     seconds = stage.elapsed()
@@ -325,8 +336,7 @@ def write_composite(stage: Stage, job: Job, composite: Composite, target: Path) 
         "spp": job.compositor.samples,
         "seconds": seconds,
         "mrays_per_second": job.compositor.rays_traced / max(seconds, 1e-9) / 1e6,
-        # one sample says nothing of its noise
-        "relative_error": relative_error if job.compositor.samples > 1 else None,
+        "relative_error": error,
         "median_standard_error": float(np.median(relative)) if relative.size else 0.0,
         "changed_pixels": int(changed.sum()),
         "denoised": job.denoise,

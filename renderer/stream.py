@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chromeball.renderer.composite import CapturedSet, Compositor
+from chromeball.renderer.converge import Convergence
 from chromeball.renderer.lights import area_lights, delta_lights
 from chromeball.renderer.mesh import Instance, Mesh, affine
 from chromeball.renderer.path import corner_rays
@@ -49,8 +50,6 @@ _HOME: dict[str, Any] = {"position": (0.0,) * 3, "rotation": (0.0,) * 3, "scale"
 REST = 0.2
 #: Samples a pixel after which an error that is out of reach is given up.
 MOST_SAMPLES = 4096
-#: Samples a pixel before an error is believed.
-_PILOT = 16
 #: Sub-samples of a background pixel without a photograph, while moving and at rest.
 _BACKGROUND = 1, 8
 
@@ -193,6 +192,7 @@ class Session:
         #: the eye that the compositor's samples belong to, and the error of its picture
         self._current: Eye | None = None
         self._error: float | None = None
+        self._converging: Convergence
         #: what ended the thread, if anything did
         self.failure: BaseException | None = None
         self._thread = threading.Thread(target=self._run, name="render", daemon=True)
@@ -436,6 +436,7 @@ class Session:
             )
             compositor.look(rays, place, back)
             self._current, self._error = eye, None
+            self._converging = Convergence(compositor.counts_all_noise())
         if moving:
             compositor.add(settings.samples)
             rgb, done = compositor.picture(), False
@@ -445,7 +446,7 @@ class Session:
             elif not self._is_enough(compositor, settings):  # as many again, up to a limit
                 compositor.refine(min(16, compositor.samples))
             result = compositor.result()
-            self._error = result.relative_error() if compositor.samples > 1 else None
+            self._error = self._converging.error(result, compositor.samples)
             rgb, done = result.rgb, self._is_enough(compositor, settings)
         codes = to_display(rgb, self.exposure * 2.0**settings.stops)
         seconds = self._clock() - start
@@ -462,7 +463,8 @@ class Session:
 
     def _is_enough(self, compositor: Compositor, settings: Settings) -> bool:
         low = self._error is not None and self._error <= settings.error
-        return (compositor.samples >= _PILOT and low) or compositor.samples >= MOST_SAMPLES
+        least = self._converging.least()
+        return (compositor.samples >= least and low) or compositor.samples >= MOST_SAMPLES
 
     def _ready(self, integrator: Light, objects: list[Object]) -> Compositor:
         """The integrator's compositor, its world brought to `objects` by the cheapest way."""
