@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from chromeball.renderer.composite import CapturedSet, Composite, Compositor
+from chromeball.renderer.composite import CapturedSet, Composite, Compositor, Integrator
 from chromeball.renderer.converge import Convergence
 from chromeball.renderer.mesh import Kind, Mesh
 from chromeball.renderer.path import corner_rays
@@ -39,33 +39,39 @@ def sunny(width: int = 1) -> NDArray[np.float32]:
     return sky
 
 
+@dataclass(frozen=True)
+class Scene:
+    """A sky, objects, and the errors to ask for: each integrator's takes about a second."""
+
+    sky: NDArray[np.float32]
+    objects: list[Mesh]
+    wanted: dict[Integrator, float]
+
+
 SCENES = {
-    "a ball under clouds": (cloudy(), [ball(Kind.DIFFUSE, 0.7, 0, 1)], 0.02, 0.02),
-    "two balls in the sun": (
+    "a ball under clouds": Scene(
+        cloudy(), [ball(Kind.DIFFUSE, 0.7, 0, 1)], {"path": 0.02, "direct": 0.02}
+    ),
+    "two balls in the sun": Scene(
         sunny(),
         [ball(Kind.DIFFUSE, 0.6, -0.5, 1), ball(Kind.DIFFUSE, 0.3, 0.6, 0.6)],
-        0.015,
-        0.04,
+        {"path": 0.015, "direct": 0.04},
     ),
-    "glass and mirror": (
+    "glass and mirror": Scene(
         sunny(5),
         [ball(Kind.GLASS, 0.95, -0.5, 1), ball(Kind.MIRROR, 0.9, 0.6, 0.6)],
-        0.03,
-        0.03,
+        {"path": 0.03, "direct": 0.03},
     ),
 }
 
 
-def begun(
-    name: str, seed: int, samples: int, integrator: Literal["path", "direct"]
-) -> Compositor:
-    sky, objects = SCENES[name][:2]
+def begun(scene: Scene, seed: int, samples: int, integrator: Integrator) -> Compositor:
     w = np.array([[-4, 0, -4], [4, 0, -4], [4, 0, 4], [-4, 0, 4]], np.float32)
     faces = np.array([[0, 2, 1], [0, 3, 2]], np.uint32)
     floor = StandInMesh(w, w, faces, np.zeros(2, np.uint8))
     return Compositor(
-        objects,
-        CapturedSet(sky, np.array([0.0, 1.0, 0.0]), floor),
+        scene.objects,
+        CapturedSet(scene.sky, np.array([0.0, 1.0, 0.0]), floor),
         corner_rays(CAMERA),
         POSE.translation,
         np.full((24, 32, 3), 0.3, np.float32),
@@ -82,22 +88,24 @@ def difference(a: Composite, truth: Composite) -> float:
     return float(np.sqrt(np.mean(error**2)) / truth.rgb[pixels].mean())
 
 
-# path says more than it errs, as its samples are spread better than at random. direct may err
-# by three times what it says: lamps that many pixels share scatter little within a picture
+# true error over what is said: of 8 seeds 0.44-0.76 with path, whose samples are spread better
+# than at random, and 0.57-1.48 with direct, where lamps that many pixels share scatter little
+# within a picture
 @pytest.mark.parametrize(
-    ("integrator", "least", "most"), [("path", 0.25, 1.2), ("direct", 0, 3)]
+    ("integrator", "least", "most"), [("path", 0.3, 1.2), ("direct", 0.35, 2.5)]
 )
 @pytest.mark.parametrize("name", SCENES)
 def test_the_true_error_is_about_what_is_said(
-    name: str, integrator: Literal["path", "direct"], least: float, most: float
+    name: str, integrator: Integrator, least: float, most: float
 ) -> None:
-    wanted = SCENES[name][2 if integrator == "path" else 3]
-    reference = begun(name, 99, 1024, integrator)
+    scene = SCENES[name]
+    wanted = scene.wanted[integrator]
+    reference = begun(scene, 99, 1024, integrator)
     for _ in range(8 if integrator == "path" else 12):
         reference.add(256)
     truth = reference.result()
     for seed in (1, 2):
-        job = begun(name, seed, 256, integrator)
+        job = begun(scene, seed, 256, integrator)
         told: list[float | None] = []
         composite, said = accumulate(
             job, Budget(error=wanted), lambda _, error, told=told: told.append(error)
@@ -107,7 +115,7 @@ def test_the_true_error_is_about_what_is_said(
         assert told[-1] == said  # the progress showed it
         assert job.samples < 8192
         true = difference(composite, truth)
-        assert least * said <= true <= most * said + 0.25 * wanted  # the truth errs, too
+        assert least * said <= true <= most * said
 
 
 def test_what_doubling_changes_is_the_error_of_independent_samples() -> None:
