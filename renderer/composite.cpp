@@ -6,7 +6,7 @@
 namespace chromeball {
 namespace {
 
-constexpr int kMostScatterings = 128;  // a path lost between mirrors ends here, black
+constexpr int kMostScatterings = 1024;  // a path lost between mirrors ends here, black
 constexpr int kSureScatterings = 8;  // roulette may end a path after these
 constexpr int kMostPassed = 256;
 
