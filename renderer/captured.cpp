@@ -137,15 +137,20 @@ Captured::Light Captured::draw(uint32_t k, uint64_t seed) const {
   const uint32_t stratum = uint32_t((uint64_t(1) << 32) / kLights);
   const uint32_t bits = k * stratum + uint32_t(h) % stratum;
   const Environment::Sample s = environment_.sample(bits, float(h >> 40) * 0x1p-24f);
-  if (planes_.empty()) return {s.direction, false, {}, s.density};
-  const Plane& plane = planes_[s.texel];
-  if (is_zero(plane.n)) return {s.direction, false, {}, s.density};
+  return laid(s.direction, s.texel, s.density);
+}
+
+// The light in direction w of the map, on the plane that its texel showed.
+Captured::Light Captured::laid(Vec3 w, uint32_t texel, float density) const {
+  if (planes_.empty()) return {w, false, {}, density};
+  const Plane& plane = planes_[texel];
+  if (is_zero(plane.n)) return {w, false, {}, density};
   // q = o + z w, the light's place
-  const float cos = dot(plane.n, s.direction);
+  const float cos = dot(plane.n, w);
   const float z = (plane.offset - dot(plane.n, origin_)) / cos;
   if (!(z > 0 && z < kInfinity)) return {};
-  const Vec3 q = origin_ + z * s.direction;
-  const float density = s.density * std::abs(cos) / (z * z);
+  const Vec3 q = origin_ + z * w;
+  density *= std::abs(cos) / (z * z);
   if (plane.moved != Plane::kStays) return carried(plane.moved, q, density);
   return {q, true, plane.n, density};
 }
@@ -182,29 +187,51 @@ Captured::Sample Captured::sample(Vec3 x, Pair u) const {
   return {to * (1 / t), t, light.density * x2 / cos_x};
 }
 
-float Captured::density(Vec3 x, Vec3 d, const Place& place) const {
-  if (environment_.even()) return 0;
+// Where the map holds what d meets at `place`, if `laid` brings it there: not for places that the
+// map did not see.
+Captured::Origin Captured::origin_of(Vec3 d, const Place& place) const {
   if (!place) {
     const bool infinite = planes_.empty() || is_zero(planes_[environment_.texel_of(d)].n);
-    return infinite ? environment_.density(d) : 0;
+    return infinite ? Origin{d, 0, nullptr} : Origin{};
   }
   const Vec3 from_o = place.captured_at - origin_;
   const float distance = length(from_o);
-  if (!(distance > 0)) return 0;
+  if (!(distance > 0)) return {};
   const Vec3 w = from_o * (1 / distance);
   const Plane& plane = planes_[environment_.texel_of(w)];
   const float slack = 1e-4f * distance + kLift * largest_magnitude(place.captured_at);
   const float off = dot(plane.n, place.captured_at) - plane.offset;
-  if (is_zero(plane.n) || !(std::abs(off) < slack)) return 0;
-  if (plane.moved == Plane::kStays) {
-    if (!(length(place.p - place.captured_at) < slack)) return 0;
-    return environment_.density(w) * jacobian(x, place.p, plane.n);
+  if (is_zero(plane.n) || !(std::abs(off) < slack)) return {};
+  const bool there = plane.moved == Plane::kStays
+                         ? length(place.p - place.captured_at) < slack
+                         : plane.moved == place.face;
+  return there ? Origin{w, distance, &plane} : Origin{};
+}
+
+Vec3 Captured::peak(Vec3 d, const Place& place) const {
+  const Origin from = origin_of(d, place);
+  return from ? peaks_->radiance(from.w) : Vec3();
+}
+
+Captured::Peak Captured::sample_peak(Pair u) const {
+  const Peaks::Sample s = peaks_->sample(u);
+  const Light light = laid(s.direction, s.texel, s.density);
+  return {light.place, light.finite, light.n, s.radiance, light.density};
+}
+
+float Captured::density(Vec3 x, Vec3 d, const Place& place) const {
+  if (environment_.even()) return 0;
+  const Origin from = origin_of(d, place);
+  if (!from) return 0;
+  if (!from.plane) return environment_.density(from.w);
+  const auto& [w, distance, plane] = from;
+  if (plane->moved == Plane::kStays) {
+    return environment_.density(w) * jacobian(x, place.p, plane->n);
   }
-  if (plane.moved != place.face) return 0;
   const Vec3 to = place.p - x;
   const float x2 = length2(to), cos_x = std::abs(dot(to, place.n)) / std::sqrt(x2);
   if (!(cos_x > 1e-6f)) return 0;
-  const float cos_o = std::abs(dot(w, plane.n));
+  const float cos_o = std::abs(dot(w, plane->n));
   return environment_.density(w) * cos_o * x2 / (distance * distance * cos_x * growth(place.face));
 }
 

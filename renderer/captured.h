@@ -2,6 +2,7 @@
 // light comes from places instead of directions (seeds F11, F12).
 #pragma once
 
+#include <optional>
 #include <span>
 #include <vector>
 
@@ -113,6 +114,21 @@ class Captured {
   // The density with which `sample` picks direction d, whose first place is `place`.
   float density(Vec3 x, Vec3 d, const Place& place) const;
 
+  // The peaks of the map as lamps that light is traced from.
+  struct Peak {
+    Vec3 place;  // as of a Lamp
+    bool finite = false;
+    Vec3 n;
+    Vec3 radiance;
+    float density = 0;  // 1/m^2; of a direction 1/sr; 0: no light
+  };
+  void find_peaks() { peaks_.emplace(environment_); }
+  bool peaks_found() const { return peaks_.has_value(); }
+  const Peaks& peaks() const { return *peaks_; }
+  Peak sample_peak(Pair u) const;
+  // What such lamps send from what d meets: a part of `radiance`, of which they hold all.
+  Vec3 peak(Vec3 d, const Place& place) const;
+
  private:
   // The plane that a texel's centre showed when the map was captured: n . q = offset; n = 0 for
   // the infinite environment. Where it has moved since, the face that carries its light.
@@ -131,7 +147,15 @@ class Captured {
   };
   static constexpr uint32_t kLights = 8192;
   void find_planes();
+  struct Origin {
+    Vec3 w;              // unit, from the map's origin
+    float distance = 0;
+    const Plane* plane = nullptr;  // none: the infinite environment
+    explicit operator bool() const { return !is_zero(w); }
+  };
+  Origin origin_of(Vec3 d, const Place& place) const;
   Light draw(uint32_t k, uint64_t seed) const;
+  Light laid(Vec3 w, uint32_t texel, float density) const;
   Light carried(uint32_t face, Vec3 q, float density) const;
   float growth(uint32_t face) const;  // of a face's area since the map was captured
 
@@ -144,6 +168,7 @@ class Captured {
   Accel accel_;
   std::vector<Plane> planes_;
   std::vector<Light> lights_;
+  std::optional<Peaks> peaks_;
   bool flat_ = true;
 };
 

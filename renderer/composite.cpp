@@ -9,6 +9,7 @@ namespace {
 constexpr int kMostScatterings = 1024;  // a path lost between mirrors ends here, black
 constexpr int kSureScatterings = 8;  // roulette may end a path after these
 constexpr int kMostPassed = 256;
+constexpr float kSplit = 0.2f;
 
 bool is_one(Vec3 v) { return v.x == 1 && v.y == 1 && v.z == 1; }
 
@@ -20,6 +21,7 @@ Compositor::Compositor(World& objects, const StandIn& stand_in, const Environmen
       captured_(stand_in, environment, origin, seed),
       irradiance_(captured_, seed),
       table_(expected_samples, seed),
+      photon_table_(SampleTable::kMost, seed + 1),
       bounces_(bounces),
       seed_(mix64(seed + 0x436f6d70u)) {
   bounds_ = Bounds(objects_->bounds());
@@ -80,43 +82,66 @@ Compositor::Meeting Compositor::meet(Vec3 o, Vec3 d, Vec3& share, Path& path) co
 
 // Radiance that an object sends against d. Directions that are certain are always followed;
 // `bounces` counts the interreflections that are left, at -1 only lamps and mirrors are seen.
-Vec3 Compositor::object_radiance(Hit hit, Vec3 d, int bounces, Path& path) const {
+Vec3 Compositor::object_radiance(Hit hit, Vec3 d, Trail trail, Path& path) const {
   Vec3 sum, beta(1.0f), from;
   float arrived = 0;  // density with which d was chosen at `from`; 0: not against light sampling
+  int bounces = trail.bounces;
+  bool certain = true;  // every direction so far
+  float kept = 1;       // of the light, where glass was followed both ways
   for (int k = 0; k < kMostScatterings; ++k) {
     const Surface s = objects_->surface_at(hit, d);
     if (!is_zero(s.emission)) {
       const float other = arrived > 0 ? lamp_density(s, hit, from, d) : 0;
-      sum += (other > 0 ? arrived / (arrived + other) : 1) * beta * s.emission;
+      const bool by_photons = trail.from_set && path.photons && certain && k > 0;
+      const float rest = by_photons ? 1 - captured_.peaks().share(s.emission) : 1;
+      sum += (other > 0 ? arrived / (arrived + other) : rest) * beta * s.emission;
     }
     const bool specular = is_specular(s);
     if (!specular) {
       if (bounces < 0) return sum;
       sum += beta * (direct_light(s, -d, bounces, path) + delta_light(s, -d, path));
     }
-    const Scatter next = sample(s, -d, path.sampler);
+    Scatter next, other;
+    if (trail.share * largest(beta) > kSplit && split(s, -d, next, other)) {
+      const float share = trail.share * largest(beta * other.weight);
+      sum += beta * other.weight * beyond(s, other.wi, {bounces, false, share}, path);
+      kept *= largest(next.weight);
+    } else {
+      next = sample(s, -d, path.sampler);
+    }
     beta *= next.weight;
     if (largest(beta) <= 0) return sum;
     if (k >= kSureScatterings) {  // the root ends fewer, and those it spares stay quiet
-      const float survive = std::min(1.0f, std::sqrt(largest(beta)));
+      const float survive = std::min(1.0f, std::sqrt(largest(beta) / kept));
       if (survive < 1 && path.sampler.pair().x >= survive) return sum;
       beta *= 1 / survive;
     }
     d = next.wi;
     arrived = next.density;
+    certain &= next.density == 0;
     const Vec3 o = from = s.start(d);
     const auto [object, place] = meet(o, d, beta, path);
     hit = object;
     if (!hit) {
       const float other = next.density > 0 ? captured_.density(o, d, place) : 0;
       const float w = other > 0 ? next.density / (next.density + other) : 1;
-      return sum + w * beta * stand_in_radiance(place, d, bounces, path);
+      Vec3 L = stand_in_radiance(place, d, bounces, certain && !trail.from_set, path);
+      if (certain && trail.from_set && path.photons) L += -captured_.peak(d, place);
+      return sum + w * beta * L;
     }
     // what goes through a solid and about in it is no interreflection
     const bool within = s.transmission > 0 && (dot(d, s.ng) < 0 || !s.outside);
     if (next.blurs && !within) --bounces;
   }
   return sum;
+}
+
+// What arrives at a surface against a certain direction d.
+Vec3 Compositor::beyond(const Surface& s, Vec3 d, Trail trail, Path& path) const {
+  Vec3 share(1.0f);
+  const auto [hit, place] = meet(s.start(d), d, share, path);
+  return share * (hit ? object_radiance(hit, d, trail, path)
+                      : stand_in_radiance(place, d, trail.bounces, true, path));
 }
 
 // The density over solid angle at `from` with which light sampling picks a lamp's place.
@@ -159,7 +184,7 @@ Vec3 Compositor::captured_light(const Surface& s, Vec3 wo, int bounces, Path& pa
   const Place place = meet_stand_in(x, light.d, kInfinity, path);
   if (!Captured::reaches(light, place)) return {};
   return (1 / (light.density + density(s, wo, light.d))) * f *
-         stand_in_radiance(place, light.d, bounces, path);
+         stand_in_radiance(place, light.d, bounces, false, path);
 }
 
 // The captured set stands in the way of a light. Geometry that only emits stands for what is
@@ -207,10 +232,11 @@ Vec3 Compositor::delta_change(Vec3 x, Vec3 n, Path& path) const {
 }
 
 // What a ray sees of the set with the objects in it: L_cap Q.
-Vec3 Compositor::stand_in_radiance(const Place& place, Vec3 d, int bounces, Path& path) const {
+Vec3 Compositor::stand_in_radiance(const Place& place, Vec3 d, int bounces, bool all,
+                                   Path& path) const {
   const Vec3 captured = captured_.radiance(place, d);
   if (!place.support || bounces <= 0) return captured;
-  return captured * (Vec3(1.0f) + relative_change(place, bounces - 1, false, path));
+  return captured * (Vec3(1.0f) + relative_change(place, bounces - 1, all, path));
 }
 
 // (L_with - L_without) cos for a direction whose first hit is an object, over the density with
@@ -222,7 +248,7 @@ Vec3 Compositor::change(Vec3 x, Vec3 n, Vec3 d, const Hit& hit, Vec3 share, cons
   Vec3 with = share * without;  // only coloured
   if (hit) {
     if (objects_->shines()) density += lamp_density(objects_->surface_at(hit, d), hit, x, d);
-    with = share * object_radiance(hit, d, bounces - 1, path);
+    with = share * object_radiance(hit, d, {bounces - 1, true}, path);
   }
   return (dot(d, n) / density) * (with - without);
 }
@@ -284,6 +310,7 @@ Vec3 Compositor::relative_change(const Place& place, int bounces, bool all, Path
     }
     if (lamps && (all || one == 2)) dE += lamp_change(x, n, cones, bounces, path);
     if (!all) dE *= float(strategies);
+    if (path.photons) dE += path.photons->irradiance(x, n, path.map);
   }
   dE += delta_change(x, n, path);
   if (is_zero(dE)) return {};
@@ -292,9 +319,12 @@ Vec3 Compositor::relative_change(const Place& place, int bounces, bool all, Path
 }
 
 uint64_t Compositor::pass(const Camera& camera, const float* plate, bool difference,
-                          const uint16_t* counts, float* film) const {
+                          const uint16_t* counts, const Caustics& caustics,
+                          float* film) {
+  if (caustics.count && !captured_.peaks_found()) captured_.find_peaks();
   const PixelRays& rays = camera.rays;
   std::atomic<uint64_t> traced{0};
+  const Photons photons = this->photons(caustics, traced);
   const tbb::blocked_range2d<int> tiles(0, rays.height, 8, 0, rays.width, 8);
   tbb::parallel_for(tiles, [&](const auto& tile) {
     const FlushDenormals flush;
@@ -310,6 +340,7 @@ uint64_t Compositor::pass(const Camera& camera, const float* plate, bool differe
         for (uint32_t i = first; i < first + counts[pixel]; ++i) {
           Sampler sampler(table_, seed_ + pixel, i);
           Path path{sampler};
+          if (!photons.empty()) path.photons = &photons, path.map = (i - first) % photons.maps();
           const auto [o, d, time] = camera.sample(y, x, sampler);
           path.time = time;
           const Place place = meet_stand_in(o, d, kInfinity, path);

@@ -8,6 +8,7 @@
 #include "captured.h"
 #include "irradiance.h"
 #include "path.h"
+#include "photons.h"
 #include "world.h"
 
 namespace chromeball {
@@ -41,10 +42,15 @@ class Compositor {
   // A new place for an object.
   void move(uint32_t object, const double* matrices, size_t steps = 1);
 
+  // Caustics by photons: a pass takes the maps `first` and on, `maps` of them, one a sub-sample,
+  // each of `count` photons. Without photons light is found from where it lands alone.
+  struct Caustics {
+    uint32_t first = 0, maps = 0, count = 0;
+  };
   // Adds the next counts (H, W) sub-samples of each pixel to film (H, W, Film::kCount).
   // `plate` (H, W, 3) is only used to know how bright a change is. Returns rays traced.
   uint64_t pass(const Camera& camera, const float* plate, bool difference,
-                const uint16_t* counts, float* film) const;
+                const uint16_t* counts, const Caustics& caustics, float* film);
 
   // The captured set alone through the camera, mean of `count` sub-samples: a plate.
   void background(const Camera& camera, uint32_t count, float* radiance) const;
@@ -59,6 +65,8 @@ class Compositor {
     Sampler& sampler;
     uint64_t rays = 0;
     float time = 0;  // of the shutter's opening
+    const Photons* photons = nullptr;  // none: no peaks of light come by photons
+    uint32_t map = 0;
   };
 
   // The first object that does not let the ray through; multiplies `share` by what comes through
@@ -73,7 +81,17 @@ class Compositor {
   };
   Meeting meet(Vec3 o, Vec3 d, Vec3& share, Path& path) const;
 
-  Vec3 object_radiance(Hit hit, Vec3 d, int bounces, Path& path) const;
+  // Where a path to an object comes from.
+  struct Trail {
+    int bounces;            // interreflections left
+    bool from_set = false;  // from a surface of the set, where photons may land
+    float share = 0;        // of the picture's light that it carries; 0: it is never split
+  };
+  Vec3 object_radiance(Hit hit, Vec3 d, Trail trail, Path& path) const;
+  Vec3 object_radiance(Hit hit, Vec3 d, int bounces, Path& path) const {
+    return object_radiance(hit, d, Trail{bounces, false, 1}, path);
+  }
+  Vec3 beyond(const Surface& s, Vec3 d, Trail trail, Path& path) const;
   Vec3 direct_light(const Surface& s, Vec3 wo, int bounces, Path& path) const;
   Vec3 captured_light(const Surface& s, Vec3 wo, int bounces, Path& path) const;
   float lamp_density(const Surface& s, const Hit& hit, Vec3 from, Vec3 d) const;
@@ -81,7 +99,8 @@ class Compositor {
   Vec3 delta_change(Vec3 x, Vec3 n, Path& path) const;
   bool in_shadow_of_set(Vec3 x, const DeltaLight& light, const DeltaLight::Incident& in,
                         Path& path) const;
-  Vec3 stand_in_radiance(const Place& place, Vec3 d, int bounces, Path& path) const;
+  // `all`: by all strategies for the change.
+  Vec3 stand_in_radiance(const Place& place, Vec3 d, int bounces, bool all, Path& path) const;
 
   // The strategies for dE at x on a support with normal n.
   Vec3 change(Vec3 x, Vec3 n, Vec3 d, const Hit& hit, Vec3 share, const Place& behind,
@@ -91,11 +110,20 @@ class Compositor {
   Vec3 lamp_change(Vec3 x, Vec3 n, const Cones& cones, int bounces, Path& path) const;
   Vec3 relative_change(const Place& place, int bounces, bool all, Path& path) const;
 
+  // Light that goes from peaks of the map and from lamps to objects that throw caustics.
+  struct Sources;
+  struct Beam;
+  Beam beam(const Sources& sources, Path& path) const;
+  bool reaches(const Beam& beam, const Surface& s, Path& path) const;
+  // The photon that such light becomes; without flux where it lands nowhere.
+  Photon photon(const Sources& sources, Path& path) const;
+  Photons photons(const Caustics& caustics, std::atomic<uint64_t>& traced) const;
+
   World* objects_;
   Bounds bounds_;
   Captured captured_;
   Irradiance irradiance_;
-  SampleTable table_;
+  SampleTable table_, photon_table_;
   int bounces_;
   uint64_t seed_;
 };

@@ -37,8 +37,8 @@ _COVERAGE, _SUPPORT, _DEPTH, _SURFACES, _SQUARE, _BRIGHTNESS, _SAMPLES, _COUNT =
     15,
     16,
 )
-#: Samples of one pass of the direct integrator.
-_DIRECT_PASS = 16
+#: Most samples of one pass.
+_PASS = 16
 #: Samples of a pixel before its noise is known well enough to steer by.
 _PILOT = 8
 
@@ -150,6 +150,10 @@ class Compositor:
         more than its noise. The plate is never smoothed.
     lens
         Pixel filter, aperture and shutter; none: a pinhole that sees the pixels' area.
+    photons
+        How many photons ``path`` traces for each sample of a pixel: light that mirrors and
+        glass throw onto the set from lamps and the brightest parts of the map (caustics;
+        Jensen 1996, Knaus and Zwicker 2011). 0: it is found from the set alone, by chance.
 
     """
 
@@ -170,6 +174,7 @@ class Compositor:
         integrator: Integrator = "path",
         filtered: bool = True,
         lens: Lens | None = None,
+        photons: float = 0.25,
     ) -> None:
         if integrator == "ao":
             if plate is None:
@@ -193,6 +198,7 @@ class Compositor:
         )
         self._direct = None if integrator == "path" else core.Direct(self._core, seed)
         self._filtered = filtered
+        self._photons = photons
         self.look(rays, camera, plate, lens)
 
     def look(
@@ -277,16 +283,15 @@ class Compositor:
         if self._direct is not None:
             if rows is not None:
                 raise UserError("tiles are for the path integrator: direct makes whole frames")
-            for count in [_DIRECT_PASS] * (samples // _DIRECT_PASS) + [samples % _DIRECT_PASS]:
-                if count:
-                    self.rays_traced += self._direct.add(self._rays, self._place, count)
+            for count in _passes(samples):
+                self.rays_traced += self._direct.add(self._rays, self._place, count)
             self.samples += samples
             return
-        counts = np.full(self._film.shape[:2], samples, np.uint16)
-        if rows is not None:
-            counts[~rows] = 0
-        self._add(counts)
-        self.samples += samples
+        for count in _passes(samples):
+            counts = np.full(self._film.shape[:2], count, np.uint16)
+            if rows is not None:
+                counts[~rows] = 0
+            self._add(counts, count)
 
     def counts_all_noise(self) -> bool:
         """Whether ``standard_error`` holds all noise; direct's knows its shadow rays alone."""
@@ -326,8 +331,7 @@ class Compositor:
         # rounded so that fractions add up along the rows
         rows = np.cumsum(counts, axis=1)
         whole = np.diff(np.floor(rows), axis=1, prepend=0.0)
-        self._add(np.minimum(whole, 8192).astype(np.uint16))
-        self.samples += samples
+        self._add(np.minimum(whole, 8192).astype(np.uint16), samples)
 
     def samples_per_pixel(self) -> NDArray[np.float32]:
         """How many samples each pixel (H, W) has; 0 outside the lens."""
@@ -335,10 +339,13 @@ class Compositor:
             return (self._seen * self.samples).astype(np.float32)
         return self._film[..., _SAMPLES].copy()
 
-    def _add(self, counts: NDArray[np.uint16]) -> None:
+    def _add(self, counts: NDArray[np.uint16], samples: int) -> None:
+        photons = round(self._photons * float(self._seen.sum()))
+        caustics = (self.samples, min(samples, _PASS), photons)
         self.rays_traced += self._core.add(
-            self._camera, self.plate, self._difference, counts, self._film
+            self._camera, self.plate, self._difference, counts, caustics, self._film
         )
+        self.samples += samples
 
     def _relative_deviation(self) -> NDArray[np.float64]:
         """Standard deviation of one sample of each pixel (H, W), relative to its brightness."""
@@ -427,6 +434,11 @@ class Compositor:
             kept=_float32(kept),
             added=_float32(added),
         )
+
+
+def _passes(samples: int) -> list[int]:
+    """So many samples in passes."""
+    return [_PASS] * (samples // _PASS) + [samples % _PASS] * (samples % _PASS > 0)
 
 
 def _neighbourhood(values: NDArray[np.float64]) -> NDArray[np.float64]:

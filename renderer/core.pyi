@@ -124,6 +124,7 @@ class Compositor:
         plate: NDArray[float32],
         difference: bool,
         counts: NDArray[uint16],
+        caustics: tuple[int, int, int],
         film: NDArray[float32],
     ) -> int: ...
     def background(self, camera: Camera, count: int) -> NDArray[float32]: ...

@@ -59,9 +59,7 @@ std::vector<float> reordered(const std::vector<float>& x, const std::vector<uint
   return y;
 }
 
-struct Pixel {
-  float u, v;  // texel centres at integers
-};
+using Pixel = Environment::Pixel;
 
 Pixel pixel_of(Vec3 d, int h, int w) {
   const float lon = std::atan2(-d.x, d.z), lat = std::asin(std::clamp(-d.y, -1.0f, 1.0f));
@@ -148,20 +146,73 @@ Environment::Sample Environment::sample(const Distribution& distribution,
                                         const std::vector<float>& probability, uint32_t bits,
                                         float v) const {
   const auto pick = distribution.sample(bits);
-  const uint32_t t = order_[pick.index];
+  const Pixel p = around(order_[pick.index], pick.rest, v);
+  return {direction_of(p, h_, w_), density_at(probability, p.u, p.v), texel_at(p)};
+}
+
+Environment::Pixel Environment::around(uint32_t texel, float u, float v) const {
   const auto tent = [](float x) {
     return x < 0.5f ? std::sqrt(2 * x) - 1 : 1 - std::sqrt(2 - 2 * x);
   };
-  const int row = int(t / w_);
-  Pixel p{float(t % w_) + tent(pick.rest), float(row) + tent(v)};
+  Pixel p{float(texel % w_) + tent(u), float(texel / w_) + tent(v)};
   // beyond the first and last row's centres the map is constant up to the pole
   if (p.v < 0) p.v = -v;
   if (p.v > float(h_ - 1)) p.v = float(h_ - 1) + (1 - v);
   if (p.u < -0.5f) p.u += w_;
   if (p.u >= w_ - 0.5f) p.u -= w_;
+  return p;
+}
+
+uint32_t Environment::texel_at(Pixel p) const {
   const int x = std::clamp(int(p.u + 0.5f), 0, w_ - 1);
   const int y = std::clamp(int(p.v + 0.5f), 0, h_ - 1);
-  return {direction_of(p, h_, w_), density_at(probability, p.u, p.v), uint32_t(y) * w_ + x};
+  return uint32_t(y) * w_ + x;
+}
+
+Peaks::Peaks(const Environment& environment) : environment_(environment) {
+  const int h = environment.h_, w = environment.w_;
+  std::vector<double> row(h);  // each sums its own texels: the same on any number of threads
+  tbb::parallel_for(0, h, [&](int y) {
+    for (int x = 0; x < w; ++x) row[y] += mean(environment.texel(uint32_t(y) * w + x));
+    row[y] *= environment.solid_angle(y);
+  });
+  level_ = kLevel * float(std::accumulate(row.begin(), row.end(), 0.0) / (4 * M_PI));
+  std::vector<float> weight;
+  for (const uint32_t t : environment.order_) {
+    const float power = (mean(environment.texel(t)) - level_) * environment.solid_angle(t / w);
+    if (!(power > 0)) continue;
+    texels_.push_back(t);
+    weight.push_back(power);
+  }
+  picks_ = Distribution(weight);
+}
+
+Peaks::Value Peaks::at(float u, float v) const {
+  const Environment::Footprint f = environment_.footprint(u, v);
+  Value value;
+  for (int k = 0; k < 4; ++k) {
+    const Vec3 L = environment_.texel(f.texel[k]);
+    const float excess = std::max(0.0f, mean(L) - level_);
+    if (excess == 0) continue;
+    value.radiance += (f.weight[k] * share(L)) * L;
+    value.power += f.weight[k] * excess * environment_.solid_angle(f.texel[k] / environment_.w_);
+  }
+  return value;
+}
+
+Vec3 Peaks::radiance(Vec3 d) const {
+  const Environment::Pixel p = pixel_of(d, environment_.h_, environment_.w_);
+  return at(p.u, p.v).radiance;
+}
+
+Peaks::Sample Peaks::sample(Pair u) const {
+  const int h = environment_.h_, w = environment_.w_;
+  const auto pick = picks_.sample(u.bits);
+  const Environment::Pixel p = environment_.around(texels_[pick.index], pick.rest, u.y);
+  const Value value = at(p.u, p.v);
+  const float r = std::sin((p.v + 0.5f) / h * kPi);
+  const float density = value.power / float(picks_.sum()) * w * h / (2 * kPi * kPi * r);
+  return {direction_of(p, h, w), density, environment_.texel_at(p), value.radiance};
 }
 
 }  // namespace chromeball

@@ -5,6 +5,7 @@
 #include <span>
 #include <vector>
 
+#include "sampler.h"
 #include "vec.h"
 
 namespace chromeball {
@@ -52,7 +53,12 @@ class Distribution {
 // Sampling is for use beside another strategy that covers all directions: its density is
 // proportional to what exceeds the map's mean (MIS compensation, Karlik et al. 2019).
 class Environment {
+  friend class Peaks;
+
  public:
+  struct Pixel {
+    float u, v;  // texel centres at integers
+  };
   // (h, w, 3) floats, row 0 is the zenith.
   Environment(const float* rgb, int h, int w);
 
@@ -83,6 +89,13 @@ class Environment {
     float weight[4];
   };
   Footprint footprint(float u, float v) const;
+  Vec3 texel(uint32_t t) const { return Vec3(&rgb_[3 * size_t(t)]); }
+  float solid_angle(int row) const {  // of a texel there
+    return 2 * kPi / w_ * (std::cos(kPi * row / h_) - std::cos(kPi * (row + 1) / h_));
+  }
+  // A place by a tent around the texel's centre; the texel that it lies in.
+  Pixel around(uint32_t texel, float u, float v) const;
+  uint32_t texel_at(Pixel p) const;
   float density_at(const std::vector<float>& probability, float u, float v) const;
   Sample sample(const Distribution& distribution, const std::vector<float>& probability,
                 uint32_t bits, float v) const;
@@ -93,6 +106,43 @@ class Environment {
   std::vector<float> whole_;        // of each texel, by its power
   std::vector<uint32_t> order_;  // texels along a Hilbert curve: near in order, near in space
   Distribution distribution_, power_;
+};
+
+// What stands out of a map: the part of each texel's radiance above a multiple of the mean. The
+// rest never exceeds that multiple.
+class Peaks {
+ public:
+  explicit Peaks(const Environment& environment);
+
+  bool empty() const { return picks_.empty(); }
+  double power() const { return picks_.sum(); }  // of all, the mean channel, over solid angle
+  // The share of a radiance that counts as peak.
+  float share(Vec3 L) const {
+    const float bright = mean(L);
+    return bright > level_ ? 1 - level_ / bright : 0;
+  }
+  Vec3 radiance(Vec3 d) const;  // of the peaks alone, bilinear
+
+  struct Sample {
+    Vec3 direction;
+    float density;  // 1/sr
+    uint32_t texel;
+    Vec3 radiance;
+  };
+  Sample sample(Pair u) const;  // by power; not of an empty map
+
+ private:
+  static constexpr float kLevel = 4;
+  struct Value {
+    Vec3 radiance;
+    float power = 0;
+  };
+  Value at(float u, float v) const;
+
+  const Environment& environment_;
+  float level_ = 0;
+  std::vector<uint32_t> texels_;  // that stand out, along the map's Hilbert curve
+  Distribution picks_{std::span<const float>()};
 };
 
 }  // namespace chromeball

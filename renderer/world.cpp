@@ -101,7 +101,10 @@ uint32_t World::add(const MeshView& view) {
   }
   rtcCommitScene(mesh.scene.get());
   device_.check();
-  for (const uint32_t m : view.material) mesh.shines |= materials_[m].power > 0;
+  for (const uint32_t m : view.material) {
+    mesh.shines |= materials_[m].power > 0;
+    mesh.sharp |= materials_[m].sharp;
+  }
   // the corners are read from Embree's buffers
   mesh.view.vertices = {mesh.triangles.vertices, view.vertices.size()};
   mesh.view.faces = {mesh.triangles.faces, view.faces.size()};
@@ -257,7 +260,7 @@ Sphere World::bound(uint32_t instance) const {
 }
 
 void World::find_bounds() {
-  bounds_.clear();
+  bounds_.clear(), sharp_bounds_.clear();
   for (const Instance& i : instances_) {
     for (const Sphere& s : meshes_[i.mesh].bounds) {
       Vec3 low = i.to_world.point(s.centre), high = low;  // of the centre's path
@@ -270,6 +273,7 @@ void World::find_bounds() {
       const float rounding = kLift * (largest_magnitude(c) + largest_magnitude(i.slack));
       const float path = 0.5f * length(high - low);
       bounds_.push_back({c, s.radius * i.scale * (1 + 1e-5f) + path + rounding});
+      if (meshes_[i.mesh].sharp) sharp_bounds_.push_back(bounds_.back());
     }
   }
 }

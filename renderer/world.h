@@ -2,6 +2,7 @@
 // and textures, and the surface at a hit.
 #pragma once
 
+#include <algorithm>
 #include <array>
 #include <memory>
 #include <optional>
@@ -53,9 +54,16 @@ class World {
   Sphere bound(uint32_t instance) const;  // around its bounding spheres
   // Whether any surface lets light straight through.
   bool transmits() const { return transmits_; }
+  // Whether any instance moves while the shutter is open.
+  bool moves() const {
+    return std::ranges::any_of(instances_, [](const Instance& i) { return !i.steps.empty(); });
+  }
   RTCScene scene() const { return top_.get(); }
   // Spheres around the parts of the instances, in the world.
   std::span<const Sphere> bounds() const { return bounds_; }
+
+  // Those of instances that can throw caustics.
+  std::span<const Sphere> sharp_bounds() const { return sharp_bounds_; }
 
   // `time`: of the shutter's opening, 0..1.
   Hit intersect(Vec3 o, Vec3 d, float tfar = kInfinity, float time = 0) const {
@@ -81,6 +89,7 @@ class World {
     float rise;     // how far before the face a ray has to end
   };
   bool shines() const { return !emitters_.empty(); }
+  double power() const { return emitters_.sum(); }  // radiance times area of all that shines
   Emitter sample_emitter(Pair u, float time = 0) const;
   float emitter_density(const Hit& hit) const {  // of that point, 1/m^2
     return material(hit).power * inverse_power_;
@@ -97,7 +106,7 @@ class World {
     Triangles triangles;
     SceneHandle scene;
     std::vector<Sphere> bounds;
-    bool shines = false;
+    bool shines = false, sharp = false;
   };
   struct Instance {
     uint32_t mesh;
@@ -131,7 +140,7 @@ class World {
   std::vector<Instance> instances_;
   std::vector<DeltaLight> delta_lights_;
   SceneHandle top_;
-  std::vector<Sphere> bounds_;
+  std::vector<Sphere> bounds_, sharp_bounds_;
   bool transmits_ = false;
   std::vector<Face> emissive_;
   Distribution emitters_{std::span<const float>()};

@@ -84,6 +84,15 @@ float density(const Surface& s, Vec3 wo, Vec3 wi) {
   return rough.at(s, rough.frame.local(wi)).density;
 }
 
+bool split(const Surface& s, Vec3 wo, Scatter& reflected, Scatter& refracted) {
+  const float eta = relative_index(s), cosi = std::min(1.0f, dot(wo, s.ns));
+  float cost = 0;
+  const float F = fresnel(cosi, eta, cost);
+  reflected = {reflect(-wo, s.ns), Vec3(F)};
+  refracted = {normalize(wo * (-1 / eta) + s.ns * (cosi / eta - cost)), (1 - F) * s.base};
+  return F < 1 && dot(reflected.wi, s.ng) > 0 && dot(refracted.wi, s.ng) < 0;
+}
+
 Scatter sample(const Surface& s, Vec3 wo, Sampler& sampler) {
   const float u = sampler.pair().x;
   if (is_clear(s)) return smooth(s, wo, u);

@@ -12,5 +12,8 @@ namespace chromeball::glass {
 Vec3 shade(const Surface& s, Vec3 wo, Vec3 wi);
 float density(const Surface& s, Vec3 wo, Vec3 wi);
 Scatter sample(const Surface& s, Vec3 wo, Sampler& sampler);
+// Of clear glass; false at total reflection, or where a shading normal bends one way to the
+// wrong side of the face.
+bool split(const Surface& s, Vec3 wo, Scatter& reflected, Scatter& refracted);
 
 }  // namespace chromeball::glass

@@ -52,6 +52,10 @@ void settle(Material& m) {
     m.glass_in = &GlassAlbedo::get(m.ior);
     m.glass_out = &GlassAlbedo::get(1 / m.ior);
   }
+  const bool smooth = m.roughness < ggx::kSmooth || m.metallic_roughness_texture >= 0;
+  const bool coat = m.clearcoat > 0 && m.clearcoat_roughness < ggx::kSmooth;
+  m.sharp = m.model != Model::diffuse &&
+            (smooth || coat || (m.model == Model::glass && m.ior < 1.001f));
   const bool cut = m.alpha_mode != AlphaMode::opaque && (m.alpha < 1 || m.base_texture >= 0);
   m.transmits = cut || m.model == Model::thin_glass;
 }
@@ -117,6 +121,11 @@ Scatter sample(const Surface& s, Vec3 wo, Sampler& sampler) {
   }
   if (s.alpha < 1) out.weight *= s.alpha;
   return out;
+}
+
+bool split(const Surface& s, Vec3 wo, Scatter& reflected, Scatter& refracted) {
+  return s.model == Model::glass && s.alpha >= 1 && s.transmission >= 1 && is_clear(s) &&
+         glass::split(s, wo, reflected, refracted);
 }
 
 Vec3 transmit(const Surface& s, Vec3 wo) {

@@ -48,6 +48,7 @@ struct Material {
   Model model = Model::diffuse;
   float power = 0;       // mean radiance
   bool transmits = false;  // some light passes straight through
+  bool sharp = false;      // some light may go on in a certain direction: it can throw caustics
   const GlassAlbedo *glass_in = nullptr, *glass_out = nullptr;  // of rough glass
 };
 
@@ -86,6 +87,8 @@ Vec3 shade(const Surface& s, Vec3 wo, Vec3 wi);
 float density(const Surface& s, Vec3 wo, Vec3 wi);
 Scatter sample(const Surface& s, Vec3 wo, Sampler& sampler);
 Vec3 transmit(const Surface& s, Vec3 wo);
+// Both ways of light at clear solid glass; false where there is but one, or another surface.
+bool split(const Surface& s, Vec3 wo, Scatter& reflected, Scatter& refracted);
 
 // Reflectance of a smooth dielectric, unpolarised (Fresnel); eta = n_inside / n_outside as the
 // ray sees it, cosi > 0. Fills the cosine of the refracted ray; 1 at total reflection.
