@@ -10,8 +10,9 @@ READY := .venv/.ready
 SOURCES := pyproject.toml CMakeLists.txt .python-version \
   $(wildcard */CMakeLists.txt */*.cpp */*.h */*/*.cpp */*/*.h)
 DATA ?=
+SECONDS_OF_FUZZ ?= 60
 
-.PHONY: help setup demo office test lint bench clean
+.PHONY: help setup demo office test lint bench sanitize clean
 
 help:
 	@echo 'make demo    set up, photograph the virtual set, run every stage, print composite and report'
@@ -19,6 +20,7 @@ help:
 	@echo 'make test    set up and run the tests'
 	@echo 'make bench   run time against error, beside the peers'
 	@echo 'make lint    ruff, mypy and pyright'
+	@echo 'make sanitize  broken files and worlds against the core with its sanitizers on'
 	@echo 'make clean   remove what was built'
 
 setup: $(READY)
@@ -74,6 +76,16 @@ lint: $(READY)
 
 bench: $(READY)
 	$(RUN)chromeball bench
+
+# The core with address and undefined sanitizers, then a minute of broken files and worlds.
+sanitize: $(READY)
+	@$(RUN)cmake -S . -B build/sanitize -G Ninja -DCMAKE_BUILD_TYPE=Release \
+	  -DCHROMEBALL_SANITIZE=ON -DPython_EXECUTABLE="$(CURDIR)/.venv/bin/python" \
+	  -Dnanobind_DIR="$$($(RUN)python -m nanobind --cmake_dir)" >/dev/null
+	@$(RUN)cmake --build build/sanitize --target renderer_core renderer_files
+	@LD_PRELOAD="$$(g++ -print-file-name=libasan.so) $$(g++ -print-file-name=libstdc++.so)" \
+	ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 \
+	  $(RUN)python -m tests.renderer.sanitize build/sanitize --seconds $(SECONDS_OF_FUZZ)
 
 clean:
 	rm -rf .venv .tools build dist demo office

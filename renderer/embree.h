@@ -116,6 +116,7 @@ inline RTCRay make_ray(Vec3 o, Vec3 d, float tfar, float time) {
 }
 
 inline Hit intersect(RTCScene scene, Vec3 o, Vec3 d, float tfar, float time = 0) {
+  if (!is_finite(o + d)) return {};  // Embree may end the process
   RTCRayHit r;
   r.ray = make_ray(o, d, tfar, time);
   r.hit.geomID = RTC_INVALID_GEOMETRY_ID;
@@ -134,6 +135,7 @@ inline Hit intersect(RTCScene scene, Vec3 o, Vec3 d, float tfar, float time = 0)
 }
 
 inline bool occluded(RTCScene scene, Vec3 o, Vec3 d, float tfar, float time = 0) {
+  if (!is_finite(o + d)) return true;
   RTCRay r = make_ray(o, d, tfar, time);
 #if CHROMEBALL_EMBREE >= 4
   rtcOccluded1(scene, &r);

@@ -12,7 +12,10 @@ from chromeball.renderer import core
 from chromeball.renderer.delta_light import DeltaLight
 from chromeball.renderer.material import Material, Texture, Wrap
 from chromeball.renderer.mesh import Instance, Mesh, Values
+from chromeball.scene.errors import UserError
 
+#: Metres from where the core counts; far beyond, squares of areas leave float32.
+_FARTHEST = 1e8
 _ALPHA_MODES = ("opaque", "mask", "blend")
 _WRAPS: tuple[Wrap, ...] = get_args(Wrap.__value__)
 
@@ -28,7 +31,7 @@ def world(
     however far that is from the world's origin.
 
     Objects that share a :class:`Mesh` share one copy of it and one BVH; materials and textures
-    that are equal are stored once.
+    that are equal are stored once. Raises UserError for objects 1e8 m away or large.
     """
     built = core.World()
     textures: dict[Texture, int] = {}
@@ -84,8 +87,9 @@ def world(
 
     for thing in objects:
         instance = thing if isinstance(thing, Instance) else Instance(thing)
-        steps = [moved_back(matrix, about) for matrix in instance.matrices()]
-        built.place(mesh(instance.mesh), np.array(steps))
+        steps = np.array([moved_back(matrix, about) for matrix in instance.matrices()])
+        _check_reach(instance.mesh.vertices, steps)
+        built.place(mesh(instance.mesh), steps)
     for light in lights:
         p = light.position
         built.add_light(
@@ -97,6 +101,18 @@ def world(
         )
     built.commit()
     return built
+
+
+def _check_reach(vertices: NDArray[np.float32], steps: NDArray[np.float64]) -> None:
+    if not len(vertices):
+        return
+    extent = np.maximum(-vertices.min(axis=0), vertices.max(axis=0)).astype(float)
+    reach = float((np.abs(steps[..., :3]) @ np.abs(extent) + np.abs(steps[..., 3])).max())
+    if reach > _FARTHEST:
+        raise UserError(
+            f"an object reaches {reach:.3g} m from the light probe, {_FARTHEST:.0e} m is the "
+            "most: is its scale right?"
+        )
 
 
 def moved_back(matrix: NDArray[np.float64], about: Values) -> NDArray[np.float64]:

@@ -26,6 +26,7 @@ int wrapped(int i, int n, Wrap wrap) {
 }
 
 Neighbours neighbours(float x, int n, Wrap wrap) {
+  if (!std::isfinite(x)) x = 0;  // large coordinates overflow between corners
   switch (wrap) {
     case Wrap::repeat: x -= std::floor(x); break;
     case Wrap::clamp: x = std::clamp(x, 0.0f, 1.0f); break;

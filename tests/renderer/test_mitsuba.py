@@ -185,7 +185,7 @@ def chance(a: Pictures, b: Pictures, pixels: NDArray[np.bool_] | None = None) ->
         if inside.sum() < 20:
             continue
         x, y = (pictures[:, inside].mean(axis=1) for pictures in (a, b))
-        p += list(ttest_ind(x, y, equal_var=False)[1])
+        p += np.asarray(ttest_ind(x, y, equal_var=False))[1].tolist()
     return min(1.0, len(p) * min(p))
 
 

@@ -11,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from chromeball.renderer.composite import CapturedSet, Composite, Compositor, Integrator
+from chromeball.renderer.material import Material, Texture
 from chromeball.renderer.mesh import Kind, Mesh
 from chromeball.renderer.path import corner_rays
 from chromeball.renderer.primitives import sphere
@@ -170,3 +171,21 @@ def test_memory_that_runs_out_is_said(tmp_path: Path) -> None:
     assert done.returncode == 1
     assert done.stderr.startswith("chromeball: not enough memory")
     assert not list((tmp_path / "build").glob("v*"))
+
+
+def test_objects_too_far_for_float32_are_refused() -> None:
+    shell = sphere(8, 16)
+    far = Mesh.of(shell[0] * np.float32(1e12), shell[1], 0.5)
+    with pytest.raises(UserError, match=r"reaches 1e\+12 m"):
+        scene(1, np.zeros(3), "path", more=[far])
+
+
+def test_texture_coordinates_that_overflow_are_texels_all_the_same() -> None:
+    vertices = np.array([[-1, 0.3, 0], [1, 0.3, 0], [0, 1, 0]], np.float32)
+    uv = np.array([[3e38, 3e38], [-3e38, 3e38], [3e38, -3e38]], np.float32)
+    picture = Texture(np.full((2, 3, 3), 0.5, np.float32))
+    material = Material(specular=0.0, base_color_texture=picture)
+    faces = np.array([[0, 1, 2]], np.uint32)
+    rendered(
+        scene(1, np.zeros(3), "path", more=[Mesh.of(vertices, faces, material=material, uv=uv)])
+    )
