@@ -87,6 +87,7 @@ Vec3 Compositor::object_radiance(Hit hit, Vec3 d, Trail trail, Path& path) const
   float arrived = 0;  // density with which d was chosen at `from`; 0: not against light sampling
   int bounces = trail.bounces;
   bool certain = true;  // every direction so far
+  bool sharp = trail.sharp && !trail.from_set;  // the same for a surface's light sampling and its own
   float kept = 1;       // of the light, where glass was followed both ways
   for (int k = 0; k < kMostScatterings; ++k) {
     const Surface s = objects_->surface_at(hit, d);
@@ -99,12 +100,12 @@ Vec3 Compositor::object_radiance(Hit hit, Vec3 d, Trail trail, Path& path) const
     const bool specular = is_specular(s);
     if (!specular) {
       if (bounces < 0) return sum;
-      sum += beta * (direct_light(s, -d, bounces, path) + delta_light(s, -d, path));
+      sum += beta * (direct_light(s, -d, bounces, sharp && keeps_detail(s), path) + delta_light(s, -d, path));
     }
     Scatter next, other;
     if (trail.share * largest(beta) > kSplit && split(s, -d, next, other)) {
       const float share = trail.share * largest(beta * other.weight);
-      sum += beta * other.weight * beyond(s, other.wi, {bounces, false, share}, path);
+      sum += beta * other.weight * beyond(s, other.wi, {bounces, false, share, sharp}, path);
       kept *= largest(next.weight);
     } else {
       next = sample(s, -d, path.sampler);
@@ -119,13 +120,14 @@ Vec3 Compositor::object_radiance(Hit hit, Vec3 d, Trail trail, Path& path) const
     d = next.wi;
     arrived = next.density;
     certain &= next.density == 0;
+    sharp &= keeps_detail(s);
     const Vec3 o = from = s.start(d);
     const auto [object, place] = meet(o, d, beta, path);
     hit = object;
     if (!hit) {
       const float other = next.density > 0 ? captured_.density(o, d, place) : 0;
       const float w = other > 0 ? next.density / (next.density + other) : 1;
-      Vec3 L = stand_in_radiance(place, d, bounces, certain && !trail.from_set, path);
+      Vec3 L = stand_in_radiance(place, d, bounces, {certain && !trail.from_set, sharp}, path);
       if (certain && trail.from_set && path.photons) L += -captured_.peak(d, place);
       return sum + w * beta * L;
     }
@@ -141,7 +143,7 @@ Vec3 Compositor::beyond(const Surface& s, Vec3 d, Trail trail, Path& path) const
   Vec3 share(1.0f);
   const auto [hit, place] = meet(s.start(d), d, share, path);
   return share * (hit ? object_radiance(hit, d, trail, path)
-                      : stand_in_radiance(place, d, trail.bounces, true, path));
+                      : stand_in_radiance(place, d, trail.bounces, {true, trail.sharp}, path));
 }
 
 // The density over solid angle at `from` with which light sampling picks a lamp's place.
@@ -152,8 +154,9 @@ float Compositor::lamp_density(const Surface& s, const Hit& hit, Vec3 from, Vec3
 
 // What comes straight from the captured set and from lamps among the objects and is sent on to
 // wo, by light sampling, weighted against the surface's own (the balance heuristic, Veach 1997).
-Vec3 Compositor::direct_light(const Surface& s, Vec3 wo, int bounces, Path& path) const {
-  Vec3 sum = captured_light(s, wo, bounces, path);
+Vec3 Compositor::direct_light(const Surface& s, Vec3 wo, int bounces, bool plate,
+                              Path& path) const {
+  Vec3 sum = captured_light(s, wo, bounces, plate, path);
   if (!objects_->shines()) return sum;
   const World::Emitter lamp = objects_->sample_emitter(path.sampler.pair(), path.time);
   const Vec3 n = dot(lamp.n, s.p - lamp.p) < 0 ? -lamp.n : lamp.n;
@@ -170,7 +173,8 @@ Vec3 Compositor::direct_light(const Surface& s, Vec3 wo, int bounces, Path& path
   return sum + (1 / (lamp.density * t2 / cos + density(s, wo, d))) * f * lamp.radiance;
 }
 
-Vec3 Compositor::captured_light(const Surface& s, Vec3 wo, int bounces, Path& path) const {
+Vec3 Compositor::captured_light(const Surface& s, Vec3 wo, int bounces, bool plate,
+                                Path& path) const {
   const auto light = captured_.sample(s.p, path.sampler.pair());
   if (!light) return {};
   Vec3 f = shade(s, wo, light.d);
@@ -184,7 +188,7 @@ Vec3 Compositor::captured_light(const Surface& s, Vec3 wo, int bounces, Path& pa
   const Place place = meet_stand_in(x, light.d, kInfinity, path);
   if (!Captured::reaches(light, place)) return {};
   return (1 / (light.density + density(s, wo, light.d))) * f *
-         stand_in_radiance(place, light.d, bounces, false, path);
+         stand_in_radiance(place, light.d, bounces, {false, plate}, path);
 }
 
 // The captured set stands in the way of a light. Geometry that only emits stands for what is
@@ -232,11 +236,28 @@ Vec3 Compositor::delta_change(Vec3 x, Vec3 n, Path& path) const {
 }
 
 // What a ray sees of the set with the objects in it: L_cap Q.
-Vec3 Compositor::stand_in_radiance(const Place& place, Vec3 d, int bounces, bool all,
+Vec3 Compositor::stand_in_radiance(const Place& place, Vec3 d, int bounces, Look look,
                                    Path& path) const {
-  const Vec3 captured = captured_.radiance(place, d);
-  if (!place.support || bounces <= 0) return captured;
-  return captured * (Vec3(1.0f) + relative_change(place, bounces - 1, all, path));
+  Vec3 captured = captured_.radiance(place, d);
+  if (!place.support) return captured;
+  if (look.plate && path.plate) captured = plate_radiance(place, captured, path);
+  if (bounces <= 0) return captured;
+  return captured * (Vec3(1.0f) + relative_change(place, bounces - 1, look.all, path));
+}
+
+// Support surfaces are matt: the plate shows them as any ray sees them, where it sees them. What
+// an object hides from the camera may be a real thing that is to be removed.
+Vec3 Compositor::plate_radiance(const Place& place, Vec3 captured, Path& path) const {
+  const Vec3 x = place.start(), to = path.plate->eye() - x;
+  if (dot(to, place.n) <= 0) return captured;
+  if (length(place.p - place.captured_at) > 8 * place.rise) return captured;
+  const Vec3 d = unit_or(to, place.n);
+  const auto seen = path.plate->at(-d);
+  if (seen.weight == 0) return captured;
+  path.rays += 2;
+  if (captured_.blocked(x, to, 1 - kLift)) return captured;
+  if (bounds_.may_hit(x, d) && objects_->occluded(x, to, 1, path.time)) return captured;
+  return mix(captured, seen.radiance, seen.weight);
 }
 
 // (L_with - L_without) cos for a direction whose first hit is an object, over the density with
@@ -319,12 +340,14 @@ Vec3 Compositor::relative_change(const Place& place, int bounces, bool all, Path
 }
 
 uint64_t Compositor::pass(const Camera& camera, const float* plate, bool difference,
-                          const uint16_t* counts, const Caustics& caustics,
-                          float* film) {
+                          bool reflects_plate, const uint16_t* counts,
+                          const Caustics& caustics, float* film) {
   if (caustics.count && !captured_.peaks_found()) captured_.find_peaks();
   const PixelRays& rays = camera.rays;
   std::atomic<uint64_t> traced{0};
   const Photons photons = this->photons(caustics, traced);
+  std::optional<Plate> seen;
+  if (reflects_plate) seen.emplace(rays, camera.origin, plate);
   const tbb::blocked_range2d<int> tiles(0, rays.height, 8, 0, rays.width, 8);
   tbb::parallel_for(tiles, [&](const auto& tile) {
     const FlushDenormals flush;
@@ -341,6 +364,7 @@ uint64_t Compositor::pass(const Camera& camera, const float* plate, bool differe
           Sampler sampler(table_, seed_ + pixel, i);
           Path path{sampler};
           if (!photons.empty()) path.photons = &photons, path.map = (i - first) % photons.maps();
+          if (seen) path.plate = &*seen;
           const auto [o, d, time] = camera.sample(y, x, sampler);
           path.time = time;
           const Place place = meet_stand_in(o, d, kInfinity, path);

@@ -9,6 +9,7 @@
 #include "irradiance.h"
 #include "path.h"
 #include "photons.h"
+#include "plate.h"
 #include "world.h"
 
 namespace chromeball {
@@ -48,9 +49,10 @@ class Compositor {
     uint32_t first = 0, maps = 0, count = 0;
   };
   // Adds the next counts (H, W) sub-samples of each pixel to film (H, W, Film::kCount).
-  // `plate` (H, W, 3) is only used to know how bright a change is. Returns rays traced.
+  // `plate` (H, W, 3) tells how bright a change is, and is seen in sharp reflections where it
+  // `reflects_plate`. Returns rays traced.
   uint64_t pass(const Camera& camera, const float* plate, bool difference,
-                const uint16_t* counts, const Caustics& caustics, float* film);
+                bool reflects_plate, const uint16_t* counts, const Caustics& caustics, float* film);
 
   // The captured set alone through the camera, mean of `count` sub-samples: a plate.
   void background(const Camera& camera, uint32_t count, float* radiance) const;
@@ -67,6 +69,7 @@ class Compositor {
     float time = 0;  // of the shutter's opening
     const Photons* photons = nullptr;  // none: no peaks of light come by photons
     uint32_t map = 0;
+    const Plate* plate = nullptr;  // what sharp reflections see; none: the map alone
   };
 
   // The first object that does not let the ray through; multiplies `share` by what comes through
@@ -86,21 +89,26 @@ class Compositor {
     int bounces;            // interreflections left
     bool from_set = false;  // from a surface of the set, where photons may land
     float share = 0;        // of the picture's light that it carries; 0: it is never split
+    bool sharp = true;      // no surface before has blurred what it sees
   };
   Vec3 object_radiance(Hit hit, Vec3 d, Trail trail, Path& path) const;
   Vec3 object_radiance(Hit hit, Vec3 d, int bounces, Path& path) const {
     return object_radiance(hit, d, Trail{bounces, false, 1}, path);
   }
   Vec3 beyond(const Surface& s, Vec3 d, Trail trail, Path& path) const;
-  Vec3 direct_light(const Surface& s, Vec3 wo, int bounces, Path& path) const;
-  Vec3 captured_light(const Surface& s, Vec3 wo, int bounces, Path& path) const;
+  Vec3 direct_light(const Surface& s, Vec3 wo, int bounces, bool plate, Path& path) const;
+  Vec3 captured_light(const Surface& s, Vec3 wo, int bounces, bool plate, Path& path) const;
   float lamp_density(const Surface& s, const Hit& hit, Vec3 from, Vec3 d) const;
   Vec3 delta_light(const Surface& s, Vec3 wo, Path& path) const;
   Vec3 delta_change(Vec3 x, Vec3 n, Path& path) const;
   bool in_shadow_of_set(Vec3 x, const DeltaLight& light, const DeltaLight::Incident& in,
                         Path& path) const;
-  // `all`: by all strategies for the change.
-  Vec3 stand_in_radiance(const Place& place, Vec3 d, int bounces, bool all, Path& path) const;
+  // How a ray looks at the set: by all strategies for the change, or one; as the plate shows it.
+  struct Look {
+    bool all = false, plate = false;
+  };
+  Vec3 stand_in_radiance(const Place& place, Vec3 d, int bounces, Look look, Path& path) const;
+  Vec3 plate_radiance(const Place& place, Vec3 captured, Path& path) const;
 
   // The strategies for dE at x on a support with normal n.
   Vec3 change(Vec3 x, Vec3 n, Vec3 d, const Hit& hit, Vec3 share, const Place& behind,

@@ -100,6 +100,7 @@ class Composite:
         return rms / mean if mean > 0 else 0.0
 
 
+type Reflect = Literal["plate", "map"]
 type Integrator = Literal["path", "direct", "ao"]
 
 
@@ -154,6 +155,9 @@ class Compositor:
         How many photons ``path`` traces for each sample of a pixel: light that mirrors and
         glass throw onto the set from lamps and the brightest parts of the map (caustics;
         Jensen 1996, Knaus and Zwicker 2011). 0: it is found from the set alone, by chance.
+    reflect
+        What mirrors, glass and gloss show of support surfaces, by ``path``: ``plate``, where
+        the camera sees them, with a soft edge to the map's picture where it does not; ``map``.
 
     """
 
@@ -175,6 +179,7 @@ class Compositor:
         filtered: bool = True,
         lens: Lens | None = None,
         photons: float = 0.25,
+        reflect: Reflect = "plate",
     ) -> None:
         if integrator == "ao":
             if plate is None:
@@ -199,6 +204,7 @@ class Compositor:
         self._direct = None if integrator == "path" else core.Direct(self._core, seed)
         self._filtered = filtered
         self._photons = photons
+        self._reflects_plate = reflect == "plate"
         self.look(rays, camera, plate, lens)
 
     def look(
@@ -343,7 +349,13 @@ class Compositor:
         photons = round(self._photons * float(self._seen.sum()))
         caustics = (self.samples, min(samples, _PASS), photons)
         self.rays_traced += self._core.add(
-            self._camera, self.plate, self._difference, counts, caustics, self._film
+            self._camera,
+            self.plate,
+            self._difference,
+            self._reflects_plate,
+            counts,
+            caustics,
+            self._film,
         )
         self.samples += samples
 

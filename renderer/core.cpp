@@ -369,7 +369,7 @@ NB_MODULE(core, m) {
       .def(
           "add",
           [](CompositorArrays& self, const CameraArrays& camera, Picture plate,
-             bool difference, Counts counts, std::array<uint32_t, 3> caustics, InOut film) {
+             bool difference, bool reflects_plate, Counts counts, std::array<uint32_t, 3> caustics, InOut film) {
             const PixelRays& rays = camera.camera.rays;
             for (const auto& a : {std::pair(plate.shape(0), plate.shape(1)),
                                   std::pair(counts.shape(0), counts.shape(1)),
@@ -379,10 +379,11 @@ NB_MODULE(core, m) {
               }
             }
             nb::gil_scoped_release release;
-            return self->pass(camera.camera, plate.data(), difference, counts.data(),
+            return self->pass(camera.camera, plate.data(), difference, reflects_plate, counts.data(),
                               {caustics[0], caustics[1], caustics[2]}, film.data());
           },
-          nb::arg("camera"), nb::arg("plate"), nb::arg("difference"), nb::arg("counts"),
+          nb::arg("camera"), nb::arg("plate"), nb::arg("difference"),
+          nb::arg("reflects_plate"), nb::arg("counts"),
           nb::arg("caustics"), nb::arg("film").noconvert())
       .def(
           "background",

@@ -123,6 +123,7 @@ class Compositor:
         camera: Camera,
         plate: NDArray[float32],
         difference: bool,
+        reflects_plate: bool,
         counts: NDArray[uint16],
         caustics: tuple[int, int, int],
         film: NDArray[float32],

@@ -119,6 +119,7 @@ def prepare(scene: Scene, folder: Path, view: View, spp: int) -> Job:
         integrator=scene.render.integrator,
         bounces=scene.render.bounces,
         mode=scene.render.composite,
+        reflect=scene.render.reflect,
         seed=scene.render.seed,
         samples=spp,
         lights=delta_lights(scene),

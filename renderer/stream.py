@@ -498,6 +498,7 @@ class Session:
             np.zeros((1, 1, 3), np.float32),
             bounces=render.bounces,
             mode=render.composite,
+            reflect=render.reflect,
             seed=render.seed,
             samples=256,
             integrator=integrator,

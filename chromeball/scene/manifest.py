@@ -522,7 +522,8 @@ class Render(Table, frozen=True):
     smooths what is kept of the plate and what is added to it, not the plate. ``filter``: how
     ``path`` weighs what is synthetic about a pixel's middle: ``box``, the pixel's area as a
     sensor's, ``gaussian`` (deviation half a pixel) or ``blackman-harris`` (3 pixels wide). The
-    plate is not filtered.
+    plate is not filtered. ``reflect``: what mirrors and glass show of support surfaces by
+    ``path``: the ``plate``, where the camera sees them, or the ``map`` alone.
     """
 
     integrator: Literal["path", "direct", "ao"] = "path"
@@ -531,6 +532,7 @@ class Render(Table, frozen=True):
     seed: Annotated[int, Meta(ge=0, le=2**62)] = 0
     bounces: Annotated[int, Meta(ge=0, le=100_000)] = 2
     composite: Literal["quotient", "difference"] = "quotient"
+    reflect: Literal["plate", "map"] = "plate"
     filter: Literal["box", "gaussian", "blackman-harris"] = "box"
 
 

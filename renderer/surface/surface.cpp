@@ -16,6 +16,8 @@ struct Neighbours {
   float weight;
 };
 
+constexpr float kDetail = 0.25f;  // roughness
+
 int wrapped(int i, int n, Wrap wrap) {
   switch (wrap) {
     case Wrap::repeat: return i < 0 ? i + n : i >= n ? i - n : i;
@@ -122,6 +124,12 @@ Scatter sample(const Surface& s, Vec3 wo, Sampler& sampler) {
   }
   if (s.alpha < 1) out.weight *= s.alpha;
   return out;
+}
+
+bool keeps_detail(const Surface& s) {
+  if (s.model == Model::diffuse) return false;
+  const bool coat = s.material->clearcoat > 0 && s.material->clearcoat_roughness < kDetail;
+  return coat || s.roughness < kDetail;
 }
 
 bool split(const Surface& s, Vec3 wo, Scatter& reflected, Scatter& refracted) {

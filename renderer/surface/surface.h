@@ -87,6 +87,8 @@ Vec3 shade(const Surface& s, Vec3 wo, Vec3 wi);
 float density(const Surface& s, Vec3 wo, Vec3 wi);
 Scatter sample(const Surface& s, Vec3 wo, Sampler& sampler);
 Vec3 transmit(const Surface& s, Vec3 wo);
+// Whether what is seen in the surface is sharp enough to look at closely.
+bool keeps_detail(const Surface& s);
 // Both ways of light at clear solid glass; false where there is but one, or another surface.
 bool split(const Surface& s, Vec3 wo, Scatter& reflected, Scatter& refracted);
 
