@@ -43,12 +43,13 @@ class Direct {
   static constexpr uint32_t kFloorLamps = 2048, kObjectLamps = 1024;
 
   uint32_t owner_of(uint32_t instance) const;
-  struct Tile;      // what is known of a tile while it is shaded
+  class Tile;
   struct ShadowRays;
   struct GatherRays;
   uint32_t plane_at(uint32_t face, Vec3 d) const;
   Vec3 normal_of(uint32_t plane) const;
   uint32_t set_lists() const { return uint32_t(owners_.size()) - 1; }
+  bool gathers() const { return bounces_ || scene_.objects_->shines(); }  // objects light the set
   bool set_matters(const Packet& packet, int lane) const;
 
   // The choices that an object may hide from somewhere in the sphere, in their order.
@@ -61,7 +62,7 @@ class Direct {
   int tiles_across() const { return (width_ + kTile - 1) / kTile; }
   int tiles_down() const { return (height_ + kTile - 1) / kTile; }
   uint64_t find_surfaces(const PixelRays& rays, Vec3 camera, Pair at, int x0, int y0);
-  uint64_t shade(const PixelRays& rays, Vec3 camera, int samples, int x0, int y0);
+  Pair middle() const;
 
   const Compositor& scene_;
   const Captured& captured_;
@@ -81,7 +82,7 @@ class Direct {
   uint64_t seed_;
   std::vector<float> distance_;   // of the stand-in through the pixel's middle, this pass
   std::vector<uint32_t> face_;
-  std::vector<uint8_t> object_;   // 1: the middle meets an object
+  std::vector<uint8_t> object_;   // which object the middle meets, 0: none; large numbers wrap
   std::vector<std::unique_ptr<FilmTile>> film_;
   std::vector<uint8_t> touched_;  // of each tile, over all passes: its film counts
 };
