@@ -65,7 +65,14 @@ void Direct::Tile::look_at_pixels() {
   const Pair middle = d.middle();
   group_count_ = 0;
   samples_of_.clear();
+  bool objects = false;
+  for (int y = std::max(y0_ - 1, 0); y < std::min(y0_ + kTile + 1, d.height_); ++y) {
+    const uint8_t* const row = &d.object_[index({0, y})];
+    const int from = std::max(x0_ - 1, 0), to = std::min(x0_ + kTile + 1, d.width_);
+    objects |= std::any_of(row + from, row + to, [](uint8_t one) { return one != 0; });
+  }
   const auto shows = [&](Pixel p) {
+    if (!objects) return Shows::set;
     const uint8_t one = d.object_[index(p)];
     bool same = true;
     for (int v = std::max(p.y - 1, 0); v <= std::min(p.y + 1, d.height_ - 1); ++v) {
@@ -153,11 +160,13 @@ void Direct::Tile::find_irradiance() {
   }
 }
 
-// Where little can be hidden few rays will do, and some pixels go without.
+// Where little can be hidden few rays will do, and some pixels go without. Two rays tell of their
+// noise, one does not.
 Direct::Tile::Asked Direct::Tile::asked(const Group& g) const {
   const float wanted = std::sqrt(g.potential / kMuch) * float(samples_);
   const int most = int(std::min<size_t>(g.choices.size(), size_t(kRays * samples_)));
-  return {std::clamp(int(std::ceil(wanted)), 1, most), std::min(1.0f, wanted)};
+  const int rays = std::clamp(int(std::ceil(wanted)), std::min(2, most), most);
+  return {rays, std::min(1.0f, wanted / float(rays))};
 }
 
 void Direct::Tile::shadow_set() {
@@ -181,6 +190,30 @@ void Direct::Tile::shadow_row(const Group& g, int row) {
     const float u = (float(j) + shift / asked.part) / float(asked.rays);
     shadow_row(g, row, g.list->choices[g.choices[std::min(m - 1, size_t(u * float(m)))]]);
   }
+}
+
+// Rays that pass by the spheres around the objects are taken out; returns how many are left.
+int Direct::Tile::keep_those_that_may_hit(Packet& packet) const {
+  const RTCRay16& ray = packet.rays.ray;
+  alignas(64) int keep[kWidth] = {};
+  for (const Sphere& s : direct_->scene_.bounds_.few()) {
+    const float r2 = s.radius * s.radius;
+#pragma GCC ivdep
+    for (int k = 0; k < kWidth; ++k) {
+      const float x = s.centre.x - ray.org_x[k], y = s.centre.y - ray.org_y[k];
+      const float z = s.centre.z - ray.org_z[k];
+      const float along = x * ray.dir_x[k] + y * ray.dir_y[k] + z * ray.dir_z[k];
+      const float distance2 = x * x + y * y + z * z;
+      const bool ahead = (along > 0) & (distance2 - along * along <= r2 + 1e-6f * distance2);
+      keep[k] |= (distance2 <= r2) | ahead;
+    }
+  }
+  int left = 0;
+  for (int k = 0; k < kWidth; ++k) {
+    packet.valid[k] = packet.valid[k] && keep[k] ? -1 : 0;
+    left += packet.valid[k] != 0;
+  }
+  return left;
 }
 
 // What an object keeps away of one lamp's light.
@@ -222,6 +255,7 @@ void Direct::Tile::shadow_row(const Group& g, int row, const LightLists::Choice&
     packet.valid[k] = share[k] > 0 ? -1 : 0;
     left += share[k] > 0;
   }
+  if (left) left = keep_those_that_may_hit(packet);
   if (!left) return;
   occluded(objects.scene(), packet, false);
   traced_ += uint64_t(left);
@@ -340,14 +374,15 @@ void Direct::Tile::add_set(FilmTile& film) {
     film.set.variance[at] += noisy * noisy;
     if (!g.choices.empty()) {
       const Asked asked = this->asked(g);
-      const float n = float(asked.rays) * asked.part;
-      const Vec3 hidden = Vec3(q_[0][k], q_[1][k], q_[2][k]) * (1 / n);
+      const float n = float(asked.rays), all = 1 / (n * asked.part);
+      const Vec3 hidden = Vec3(q_[0][k], q_[1][k], q_[2][k]) * all;
       q += hidden;
-      const float m = mean(hidden);
+      const float m = mean(hidden), square = square_[k] * all / asked.part;
       // a single ray says 0 or all of it: its variance is bounded by what it may say
       film.set.variance[at] += asked.rays > 1
-                                   ? std::max(square_[k] / n - m * m, 0.0f) / (n - 1)
+                                   ? std::max(square - m * m, 0.0f) / (n - 1)
                                    : 0.1f * g.potential * g.potential / asked.part;
+      film.set.variance[at] += m * m * (1 - asked.part);  // others go without
     }
     film.set.r[at] += q.x, film.set.g[at] += q.y, film.set.b[at] += q.z;
   }

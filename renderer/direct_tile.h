@@ -79,7 +79,7 @@ class Direct::Tile {
   // Sub-samples of a pixel: inside objects few, each with many shadow rays; along edges many tell
   // how much of the pixel is what, and few of them are shaded.
   int subsamples(Shows shows) const {
-    return shows == Shows::edge ? std::max(8, samples_) : (samples_ + 1) / 2;
+    return shows == Shows::edge ? std::max(8 * std::min(samples_, 2), samples_) : (samples_ + 1) / 2;
   }
 
   void look_at_pixels();
@@ -96,6 +96,7 @@ class Direct::Tile {
   void shadow_set();
   void shadow_row(const Group& g, int row);
   void shadow_row(const Group& g, int row, const LightLists::Choice& choice);
+  int keep_those_that_may_hit(Packet& packet) const;
   void light_set();
   void add_set(FilmTile& film);
 

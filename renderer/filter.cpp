@@ -6,36 +6,56 @@ namespace chromeball {
 
 // Means over the passes, with an apron of the neighbours; whether there is anything.
 bool Filter::load(const FilmTile* const (&around)[9], bool objects, int passes) {
-  const float per_pass = 1 / float(passes);
   bool any = false;
   for (int y = 0; y < kSide; ++y) {
     const int down = y - kApron + kTile;
-    for (int x = 0; x < kSide; ++x) {
-      const int across = x - kApron + kTile, at = y * kSide + x;
+    for (int x = 0; x < kSide;) {  // from tile to tile
+      const int across = x - kApron + kTile, from = across % kTile;
+      const int count = std::min(kTile - from, kSide - x);
       const FilmTile* tile = around[down / kTile * 3 + across / kTile];
-      share_[at] = 0, variance_[at] = 0, group_[at] = 0;
-      for (int c = 0; c < 3; ++c) v_[c][at] = 0, n_[c][at] = 0;
-      if (!tile) continue;
-      const FilmTile::Layer& layer = objects ? tile->objects : tile->set;
-      const int i = down % kTile * kTile + across % kTile;
-      const float share = layer.share[i];
-      if (!(share > 0)) continue;
-      any = true;
-      share_[at] = share * per_pass;
-      group_[at] = layer.group[i];
-      const float* const sums[3] = {layer.r, layer.g, layer.b};
-      for (int c = 0; c < 3; ++c) {
-        const float base = objects ? tile->albedo[c][i] : share;
-        v_[c][at] = base > 0 ? sums[c][i] / base : 0;
+      const int at = y * kSide + x;
+      if (tile) {
+        any |= load(*tile, objects, down % kTile * kTile + from, count, at, passes);
+      } else {
+        for (float* to : {v_[0], v_[1], v_[2], n_[0], n_[1], n_[2], variance_, share_, group_}) {
+          std::fill_n(to + at, count, 0.0f);
+        }
       }
-      variance_[at] = layer.variance[i] * per_pass * per_pass;
-      if (!objects) continue;
-      const Vec3 n(layer.nx[i], layer.ny[i], layer.nz[i]);
-      const float l = length(n), inverse = l > 0 ? 1 / l : 0.0f;
-      n_[0][at] = n.x * inverse, n_[1][at] = n.y * inverse, n_[2][at] = n.z * inverse;
+      x += count;
     }
   }
   return any;
+}
+
+// `count` pixels of a tile in a row, from i on.
+bool Filter::load(const FilmTile& tile, bool objects, int i, int count, int at, int passes) {
+  const FilmTile::Layer& layer = objects ? tile.objects : tile.set;
+  const float per_pass = 1 / float(passes);
+  const float* const sums[3] = {layer.r, layer.g, layer.b};
+  float most = 0;
+  for (int k = 0; k < count; ++k) {
+    const float share = layer.share[i + k];
+    most = std::max(most, share);
+    share_[at + k] = share * per_pass;
+    group_[at + k] = layer.group[i + k];
+    variance_[at + k] = share > 0 ? layer.variance[i + k] * per_pass * per_pass : 0.0f;
+  }
+  for (int c = 0; c < 3; ++c) {
+    const float* const base = objects ? tile.albedo[c] : layer.share;
+    for (int k = 0; k < count; ++k) {
+      v_[c][at + k] = base[i + k] > 0 ? sums[c][i + k] / base[i + k] : 0.0f;
+    }
+  }
+  if (objects && most > 0) {
+    for (int k = 0; k < count; ++k) {
+      const float x = layer.nx[i + k], y = layer.ny[i + k], z = layer.nz[i + k];
+      const float l = std::sqrt(x * x + y * y + z * z), inverse = l > 0 ? 1 / l : 0.0f;
+      n_[0][at + k] = x * inverse, n_[1][at + k] = y * inverse, n_[2][at + k] = z * inverse;
+    }
+  } else {
+    for (float* n : n_) std::fill_n(n + at, count, 0.0f);
+  }
+  return most > 0;
 }
 
 void Filter::run(const FilmTile* const (&around)[9], bool objects, int passes, bool filter) {

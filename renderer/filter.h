@@ -38,6 +38,7 @@ class Filter {
   static constexpr int kReach = 4, kMeans = 2;  // half windows: of the filter, of the means
   static constexpr int kApron = kReach + kMeans, kSide = kTile + 2 * kApron;
   bool load(const FilmTile* const (&around)[9], bool objects, int passes);
+  bool load(const FilmTile& tile, bool objects, int i, int count, int at, int passes);
   template <bool kGuided>
   void smooth(int passes);
 
