@@ -84,16 +84,20 @@ void Filter::smooth(int passes) {
     return same * c8 * c8;
   };
 
+  // A window's ends count half, so that it holds each of 4 x 4 kinds of pixels equally often.
+  const auto edge = [](int d, int half) { return std::abs(d) == half ? 0.5f : 1.0f; };
+
   constexpr int kInner = kSide - 2 * kMeans;
   for (int y = kMeans; y < kSide - kMeans; ++y) {
     float sum[kInner] = {}, noise[kInner] = {}, weight[kInner] = {};
     for (int dy = -kMeans; dy <= kMeans; ++dy) {
       for (int dx = -kMeans; dx <= kMeans; ++dx) {
         const int row = y * kSide + kMeans, off = dy * kSide + dx;
+        const float part = edge(dx, kMeans) * edge(dy, kMeans);
 #pragma GCC ivdep
         for (int x = 0; x < kInner; ++x) {
           const int p = row + x, q = p + off;
-          const float w = alike(p, q);
+          const float w = part * alike(p, q);
           sum[x] += w * (v_[0][q] + v_[1][q] + v_[2][q]);
           noise[x] += w * variance_[q];
           weight[x] += w;
@@ -107,23 +111,24 @@ void Filter::smooth(int passes) {
     }
   }
 
-  constexpr float kWindow = (2 * kMeans + 1) * (2 * kMeans + 1);
+  constexpr float kWindow = (2 * kMeans) * (2 * kMeans);
   // Of squared differences of means, over variances. Stratified rays agree ever better than the
   // variance of single ones says.
-  const float tolerance = 8 / (kWindow * float(passes));
+  const float tolerance = (kGuided ? 8.0f : 3.0f) / (kWindow * float(passes));
   for (int y = 0; y < kTile; ++y) {
     alignas(64) float sum[4][kTile] = {}, weight[kTile] = {};
     const int row = (y + kApron) * kSide + kApron;
     for (int dy = -kReach; dy <= kReach; ++dy) {
       for (int dx = -kReach; dx <= kReach; ++dx) {
         const int off = dy * kSide + dx;
+        const float part = edge(dx, kReach) * edge(dy, kReach);
 #pragma GCC ivdep
         for (int x = 0; x < kTile; ++x) {
           const int p = row + x, q = p + off;
           const float difference = mean_[p] - mean_[q];
           const float allowed = tolerance * (noise_[p] + noise_[q]) + 1e-12f;
           const float near = std::max(0.0f, 1 - difference * difference / allowed);
-          const float w = alike(p, q) * near * near;
+          const float w = part * alike(p, q) * near * near;
           sum[0][x] += w * v_[0][q], sum[1][x] += w * v_[1][q], sum[2][x] += w * v_[2][q];
           sum[3][x] += w * w * variance_[q];
           weight[x] += w;
