@@ -130,7 +130,7 @@ void Direct::begin(int height, int width) {
   height_ = height, width_ = width, passes_ = 0;
   draw_lamps(0);
   const size_t n = size_t(height) * width, tiles = size_t(tiles_down()) * tiles_across();
-  distance_.resize(n), face_.resize(n), object_.resize(n);
+  distance_.resize(n), face_.resize(n), object_.resize(n), object_distance_.resize(n);
   film_.resize(tiles);
   touched_.assign(tiles, 0);
 }
@@ -194,8 +194,9 @@ uint64_t Direct::find_surfaces(const PixelRays& rays, Vec3 camera, Pair at, int 
       intersect(scene_.objects_->scene(), packet, true), traced += count;
       for (int k = 0; k < 16; ++k) {
         if (packet.valid[k] && packet.hits(k)) {
-          object_[size_t(y + (k >> 2)) * width_ + x + (k & 3)] =
-              uint8_t(1 + packet.hit(k).instance % 255);
+          const size_t pixel = size_t(y + (k >> 2)) * width_ + x + (k & 3);
+          object_[pixel] = uint8_t(1 + packet.hit(k).instance % 255);
+          object_distance_[pixel] = packet.rays.ray.tfar[k];
         }
       }
     }

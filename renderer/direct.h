@@ -83,6 +83,7 @@ class Direct {
   std::vector<float> distance_;   // of the stand-in through the pixel's middle, this pass
   std::vector<uint32_t> face_;
   std::vector<uint8_t> object_;   // which object the middle meets, 0: none; large numbers wrap
+  std::vector<float> object_distance_;
   std::vector<std::unique_ptr<FilmTile>> film_;
   std::vector<uint8_t> touched_;  // of each tile, over all passes: its film counts
 };

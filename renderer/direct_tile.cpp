@@ -4,6 +4,7 @@ namespace chromeball {
 namespace {
 
 constexpr float kMuch = 0.15f;  // of E that may be hidden: the full number of rays is spent
+constexpr float kJump = 0.02f;  // of the distance, between neighbours: an edge
 constexpr int kRays = 2;        // shadow rays for each sample of a pixel
 
 // Neighbours in 4 x 4 pixels look at different lamps; the filter joins what they see.
@@ -74,10 +75,13 @@ void Direct::Tile::look_at_pixels() {
   const auto shows = [&](Pixel p) {
     if (!objects) return Shows::set;
     const uint8_t one = d.object_[index(p)];
+    const float distance = d.object_distance_[index(p)], jump = kJump * distance;
     bool same = true;
     for (int v = std::max(p.y - 1, 0); v <= std::min(p.y + 1, d.height_ - 1); ++v) {
       for (int u = std::max(p.x - 1, 0); u <= std::min(p.x + 1, d.width_ - 1); ++u) {
-        same &= d.object_[index({u, v})] == one;
+        const size_t beside = index({u, v});
+        same &= d.object_[beside] == one;
+        same &= !one || std::abs(d.object_distance_[beside] - distance) < jump;
       }
     }
     return !same ? Shows::edge : one ? Shows::inside : Shows::set;
