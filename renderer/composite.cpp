@@ -339,6 +339,75 @@ Vec3 Compositor::relative_change(const Place& place, int bounces, bool all, Path
   return {E.x > 0 ? dE.x / E.x : 0, E.y > 0 ? dE.y / E.y : 0, E.z > 0 ? dE.z / E.z : 0};
 }
 
+void Compositor::set_gloss(float reflectance, float roughness) {
+  const float r = std::sqrt(reflectance);
+  Material m{};
+  m.roughness = roughness, m.specular = 1, m.ior = (1 + r) / (1 - r), m.alpha = 1;
+  m.base_texture = m.metallic_roughness_texture = m.normal_texture = m.emission_texture = -1;
+  settle(m);
+  gloss_ = m;
+}
+
+Compositor::Along Compositor::along(const Place& place, Vec3 d, int bounces, Path& path) const {
+  const Vec3 x = place.start();
+  if (dot(d, place.n) <= 0 || !bounds_.may_hit(x, d)) return {};
+  Vec3 share(1.0f);
+  const auto [hit, before] = meet(x, d, share, path);
+  if (!hit && is_one(share)) return {};
+  const Place behind = hit ? meet_stand_in(x, d, kInfinity, path) : before;
+  Along along;
+  along.behind = behind, along.t = hit.t;
+  along.lights = captured_.density(x, d, behind);
+  Vec3 with = share * captured_.radiance(behind, d);
+  if (hit) {
+    if (objects_->shines()) along.lamps = lamp_density(objects_->surface_at(hit, d), hit, x, d);
+    const Trail trail{bounces - 1, false, 1, gloss_->roughness < 0.25f};
+    with = share * object_radiance(hit, d, trail, path);
+  }
+  along.difference = with - captured_.radiance(behind, d);
+  return along;
+}
+
+Vec3 Compositor::gloss_change(const Place& place, Vec3 d, int bounces, Path& path) const {
+  Surface s{};
+  s.p = place.p, s.ng = s.ns = place.n, s.rise = place.rise, s.outside = true;
+  s.model = gloss_->model, s.roughness = gloss_->roughness, s.alpha = 1, s.material = &*gloss_;
+  Vec3 dL;
+  if (const Scatter next = sample(s, -d, path.sampler); largest(next.weight) > 0) {
+    const Along met = along(place, next.wi, bounces, path);
+    const float all = next.density + met.lights + met.lamps;
+    dL += (next.density > 0 ? next.density / all : 1) * next.weight * met.difference;
+  }
+  if (is_specular(s)) return dL;
+  const auto add = [&](Vec3 wi, auto is_own) {
+    const Vec3 f = shade(s, -d, wi);
+    if (is_zero(f)) return;
+    const Along met = along(place, wi, bounces, path);
+    if (is_zero(met.difference) || !is_own(met)) return;
+    dL += (1 / (density(s, -d, wi) + met.lights + met.lamps)) * f * met.difference;
+  };
+  if (const auto light = captured_.sample(place.start(), path.sampler.pair())) {
+    add(light.d, [&](const Along& met) { return Captured::reaches(light, met.behind); });
+  }
+  if (objects_->shines()) {
+    const auto lamp = objects_->sample_emitter(path.sampler.pair(), path.time);
+    const Vec3 to = lamp.p - place.start();
+    add(unit_or(to, place.n), [&](const Along& met) {
+      return met.lamps > 0 && std::abs(met.t - length(to)) < 1e-3f * met.t;
+    });
+  }
+  for (const DeltaLight& light : objects_->delta_lights()) {
+    const auto in = light.incident(s.p);
+    Vec3 f = is_zero(in.irradiance) ? Vec3() : shade(s, -d, in.d) * in.irradiance;
+    if (is_zero(f)) continue;
+    const Vec3 x = place.start();
+    ++path.rays;
+    f *= objects_->transmittance(x, in.d, in.t, path.time);
+    if (!is_zero(f) && !in_shadow_of_set(x, light, in, path)) dL += f;
+  }
+  return dL;
+}
+
 uint64_t Compositor::pass(const Camera& camera, const float* plate, bool difference,
                           bool reflects_plate, const uint16_t* counts,
                           const Caustics& caustics, float* film) {
@@ -383,6 +452,11 @@ uint64_t Compositor::pass(const Camera& camera, const float* plate, bool differe
             value = through * (difference ? B + dL : B * (Vec3(1.0f) + dQ));
             add(to + Film::kChange, through * dQ);
             add(to + Film::kDifference, through * dL);
+            if (gloss_) {  // no part of it lies on what is kept of the plate
+              const Vec3 shine = through * gloss_change(place, d, bounces_, path);
+              add(to + Film::kObject, shine);
+              value += shine;
+            }
             to[Film::kSupport] += 1;
           } else {
             value *= through;

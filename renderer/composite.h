@@ -54,6 +54,10 @@ class Compositor {
   uint64_t pass(const Camera& camera, const float* plate, bool difference,
                 bool reflects_plate, const uint16_t* counts, const Caustics& caustics, float* film);
 
+  // What support surfaces have beside their diffuse part: none, or a dielectric's gloss of this
+  // reflectance at normal incidence (0..1) and roughness.
+  void set_gloss(float reflectance, float roughness);
+
   // The captured set alone through the camera, mean of `count` sub-samples: a plate.
   void background(const Camera& camera, uint32_t count, float* radiance) const;
 
@@ -118,6 +122,18 @@ class Compositor {
   Vec3 lamp_change(Vec3 x, Vec3 n, const Cones& cones, int bounces, Path& path) const;
   Vec3 relative_change(const Place& place, int bounces, bool all, Path& path) const;
 
+  // What objects change of what the support's gloss at a place sends back along d (seeds P17):
+  // along directions that meet an object, and of lights without size.
+  Vec3 gloss_change(const Place& place, Vec3 d, int bounces, Path& path) const;
+  struct Along {  // a direction from the support
+    Vec3 difference;  // of radiance with objects and without; 0 where no object is met
+    float lights = 0; // the density with which light sampling picks it
+    float lamps = 0;  // the same of lamps among the objects
+    float t = kInfinity;  // of the object
+    Place behind;         // of the set
+  };
+  Along along(const Place& place, Vec3 d, int bounces, Path& path) const;
+
   // Light that goes from peaks of the map and from lamps to objects that throw caustics.
   struct Sources;
   struct Beam;
@@ -132,6 +148,7 @@ class Compositor {
   Captured captured_;
   Irradiance irradiance_;
   SampleTable table_, photon_table_;
+  std::optional<Material> gloss_;
   int bounces_;
   uint64_t seed_;
 };

@@ -72,7 +72,8 @@ class Composite:
 
     ``rgb`` (H, W, 3) scene-linear; ``alpha`` (H, W) share of the pixel that objects cover;
     ``quotient`` (H, W, 3) mean Q of the pixel's support part, 1 elsewhere; ``objects``
-    (H, W, 3) radiance of the objects times alpha; ``standard_error`` (H, W) of the pixel's
+    (H, W, 3) radiance of the objects times alpha, and what glossy support mirrors of them;
+    ``standard_error`` (H, W) of the pixel's
     mean brightness; ``depth`` (H, W) mean distance of the first surface in metres, 0 where
     there is none; ``changed`` (H, W) bool, the other pixels are the plate's bits.
     ``clipped``: pixels whose noise would have made them negative, set to 0. ``kept``,
@@ -98,6 +99,30 @@ class Composite:
         mean = float(self.rgb[self.changed].mean())
         rms = float(np.sqrt(np.mean(self.standard_error[self.changed].astype(float) ** 2)))
         return rms / mean if mean > 0 else 0.0
+
+
+@dataclass(frozen=True)
+class Gloss:
+    """What all support surfaces have beside their diffuse part: a dielectric's reflection.
+
+    ``reflectance`` at normal incidence, 0 to 0.9 (a varnished floor: 0.04), and ``roughness``,
+    0 to 1, of GGX (Walter et al. 2007) as in glTF 2.0.
+
+    Raises
+    ------
+    UserError
+        For numbers out of these ranges.
+
+    """
+
+    reflectance: float = 0.04
+    roughness: float = 0.1
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.reflectance <= 0.9:
+            raise UserError(f"a gloss of reflectance {self.reflectance}: give 0 to 0.9")
+        if not 0 <= self.roughness <= 1:
+            raise UserError(f"a gloss of roughness {self.roughness}: give 0 to 1")
 
 
 type Reflect = Literal["plate", "map"]
@@ -158,6 +183,9 @@ class Compositor:
     reflect
         What mirrors, glass and gloss show of support surfaces, by ``path``: ``plate``, where
         the camera sees them, with a soft edge to the map's picture where it does not; ``map``.
+    gloss
+        The support surfaces mirror the objects, by ``path``: what the objects change of the
+        reflection that the plate holds is added to it.
 
     """
 
@@ -180,7 +208,10 @@ class Compositor:
         lens: Lens | None = None,
         photons: float = 0.25,
         reflect: Reflect = "plate",
+        gloss: Gloss | None = None,
     ) -> None:
+        if gloss is not None and integrator != "path":
+            raise UserError("gloss of support surfaces is for the path integrator: take path")
         if integrator == "ao":
             if plate is None:
                 raise UserError("ambient occlusion has no light to show: it needs a plate")
@@ -201,6 +232,8 @@ class Compositor:
             seed,
             samples,
         )
+        if gloss is not None:
+            self._core.set_gloss(gloss.reflectance, gloss.roughness)
         self._direct = None if integrator == "path" else core.Direct(self._core, seed)
         self._filtered = filtered
         self._photons = photons
@@ -415,7 +448,7 @@ class Compositor:
         alpha = film[..., _COVERAGE] / n
         objects = film[..., _OBJECT] / n[..., None]
         change = film[..., _CHANGE] / n[..., None]
-        changed = (alpha > 0) | (change != 0).any(axis=2)
+        changed = (alpha > 0) | (change != 0).any(axis=2) | (objects != 0).any(axis=2)
         kept, added = np.repeat(1 - alpha[..., None], 3, axis=2), objects
         if self._difference:
             added = added + film[..., _DIFFERENCE] / n[..., None]

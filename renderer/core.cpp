@@ -367,6 +367,12 @@ NB_MODULE(core, m) {
           },
           nb::arg("object"), nb::arg("matrices"))
       .def(
+          "set_gloss",
+          [](CompositorArrays& self, float reflectance, float roughness) {
+            self->set_gloss(reflectance, roughness);
+          },
+          nb::arg("reflectance"), nb::arg("roughness"))
+      .def(
           "add",
           [](CompositorArrays& self, const CameraArrays& camera, Picture plate,
              bool difference, bool reflects_plate, Counts counts, std::array<uint32_t, 3> caustics, InOut film) {

@@ -13,7 +13,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from chromeball.renderer.composite import CapturedSet, Composite, Compositor, even_light
+from chromeball.renderer.composite import (
+    CapturedSet,
+    Composite,
+    Compositor,
+    Gloss,
+    even_light,
+)
 from chromeball.renderer.converge import Convergence
 from chromeball.renderer.denoise import denoise
 from chromeball.renderer.exposed import expose
@@ -120,6 +126,7 @@ def prepare(scene: Scene, folder: Path, view: View, spp: int) -> Job:
         bounces=scene.render.bounces,
         mode=scene.render.composite,
         reflect=scene.render.reflect,
+        gloss=gloss_of(scene),
         seed=scene.render.seed,
         samples=spp,
         lights=delta_lights(scene),
@@ -159,6 +166,12 @@ def captured_set(scene: Scene, folder: Path) -> tuple[CapturedSet, list[Path]]:
     stand_in, inputs = _stand_in(scene, folder)
     captured = CapturedSet(environment, _origin(env_file), stand_in)
     return captured, [env_file, *inputs]
+
+
+def gloss_of(scene: Scene) -> Gloss | None:
+    """The support surfaces' gloss; none where the scene names none."""
+    gloss = scene.render.gloss
+    return None if gloss is None else Gloss(gloss.reflectance, gloss.roughness)
 
 
 def _stand_in(scene: Scene, folder: Path) -> tuple[StandInMesh | None, list[Path]]:

@@ -26,7 +26,12 @@ from chromeball.renderer.converge import Convergence
 from chromeball.renderer.lights import area_lights, delta_lights
 from chromeball.renderer.mesh import Instance, Mesh, affine
 from chromeball.renderer.path import corner_rays
-from chromeball.renderer.render import automatic_exposure, backdrop, captured_set
+from chromeball.renderer.render import (
+    automatic_exposure,
+    backdrop,
+    captured_set,
+    gloss_of,
+)
 from chromeball.renderer.scene import (
     baked,
     instances_of,
@@ -499,6 +504,7 @@ class Session:
             bounces=render.bounces,
             mode=render.composite,
             reflect=render.reflect,
+            gloss=gloss_of(self._scene) if integrator == "path" else None,
             seed=render.seed,
             samples=256,
             integrator=integrator,

@@ -513,6 +513,16 @@ class Calibrate(Table, frozen=True):
     camera: str | None = None
 
 
+class Gloss(Table, frozen=True):
+    """The support surfaces' reflection beside their diffuse part.
+
+    ``reflectance`` at normal incidence; ``roughness`` of GGX as in glTF 2.0.
+    """
+
+    reflectance: Annotated[float, Meta(ge=0, le=0.9)] = 0.04
+    roughness: Annotated[float, Meta(ge=0, le=1)] = 0.1
+
+
 class Render(Table, frozen=True):
     """How the objects are rendered into the views.
 
@@ -523,7 +533,8 @@ class Render(Table, frozen=True):
     ``path`` weighs what is synthetic about a pixel's middle: ``box``, the pixel's area as a
     sensor's, ``gaussian`` (deviation half a pixel) or ``blackman-harris`` (3 pixels wide). The
     plate is not filtered. ``reflect``: what mirrors and glass show of support surfaces by
-    ``path``: the ``plate``, where the camera sees them, or the ``map`` alone.
+    ``path``: the ``plate``, where the camera sees them, or the ``map`` alone. ``gloss``:
+    support surfaces mirror the objects, by ``path``.
     """
 
     integrator: Literal["path", "direct", "ao"] = "path"
@@ -533,6 +544,7 @@ class Render(Table, frozen=True):
     bounces: Annotated[int, Meta(ge=0, le=100_000)] = 2
     composite: Literal["quotient", "difference"] = "quotient"
     reflect: Literal["plate", "map"] = "plate"
+    gloss: Gloss | None = None
     filter: Literal["box", "gaussian", "blackman-harris"] = "box"
 
 
