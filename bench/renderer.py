@@ -8,13 +8,19 @@ from __future__ import annotations
 
 import json
 import math
+import os
+import resource
+import subprocess
+import sys
 import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from chromeball.bench import mitsuba_peer as peer
+from chromeball.bench import renderer_mitsuba
+from chromeball.bench.renderer_mitsuba import Picture, cached, code_version, codes, rms
 from chromeball.bench.row import Row
 from chromeball.renderer.composite import CapturedSet, Compositor, Integrator
 from chromeball.renderer.mesh import Kind, Mesh
@@ -23,12 +29,12 @@ from chromeball.renderer.primitives import sphere
 from chromeball.renderer.scene import read_mesh
 from chromeball.renderer.shadow_bench import ShadowBench
 from chromeball.scene.camera import CameraModel
-from chromeball.scene.color import srgb_encode
 from chromeball.scene.image import read_rgb
 from chromeball.scene.pose import Pose
 from chromeball.stand_in.ply import SUPPORT, StandInMesh
 
 DATA = Path(__file__).resolve().parents[2] / "shared/data/render"
+WORDS = {"direct": "direct light", "diffuse": "one bounce", "mg": "mirror and glass"}
 #: The scene's axes, z up, to ours: its map's middle, +X, is our +Z.
 TURN = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])
 
@@ -38,12 +44,12 @@ def rows(quick: bool) -> list[Row]:
     if not DATA.is_dir():
         return []
     scene: dict[str, Any] = json.loads((DATA / "scene.json").read_text())
-    found = shadow_rows(quick) + load_rows(scene)
+    found = shadow_rows(quick) + load_rows()
     for variant in ("direct", "diffuse"):
-        found += direct_rows(scene, variant, quick)
-    found += path_rows(scene, "mg", quick)
-    found += bias_rows(scene, quick)
-    return found + triangle_rows(scene, quick)
+        found += direct_rows(scene, variant, quick) + mitsuba_rows(scene, variant, quick)
+    found += path_rows(scene, "mg", quick) + mitsuba_rows(scene, "mg", quick)
+    found += bias_rows(scene, quick) + frame_rows(scene, quick)
+    return found + triangle_rows(scene, quick) + size_rows(scene, quick)
 
 
 def shadow_rows(quick: bool) -> list[Row]:
@@ -95,11 +101,16 @@ def direct_rows(scene: dict[str, Any], variant: str, quick: bool) -> list[Row]:
     That its mean is right is the matter of :func:`bias_rows`. The time is that of a frame; the
     scene is loaded, the lists of lamps are drawn.
     """
-    reference = _compositor(scene, variant, 1, 16, integrator="direct", filtered=False)
-    reference.add(64 if quick else 512)
-    truth = _codes(reference.picture())
+    count = 64 if quick else 512
+
+    def converged() -> Picture:
+        reference = _compositor(scene, variant, 1, 16, integrator="direct", filtered=False)
+        reference.add(count)
+        return reference.picture()
+
+    truth = codes(cached(f"direct-{variant}", [code_version(), scene, count], converged))
     job = _compositor(scene, variant, 0, 16, integrator="direct")
-    what = f"composite 640x480, {'direct light' if variant == 'direct' else 'one bounce'}"
+    what = f"composite 640x480, {WORDS[variant]}"
     found: list[Row] = []
     for samples in (2, 3, 4, 8, 16):
         seconds, picture = math.inf, job.plate
@@ -109,7 +120,7 @@ def direct_rows(scene: dict[str, Any], variant: str, quick: bool) -> list[Row]:
             job.add(samples)
             picture = job.picture()
             seconds = min(seconds, time.process_time() - start)
-        error = float(np.sqrt(np.mean((_codes(picture) - truth) ** 2)))
+        error = rms(codes(picture) - truth)
         note = f"direct integrator, {samples} samples, {job.rays_traced / 1e6:.2f} M rays"
         found.append(Row("renderer", what, "chromeball", seconds, error, "8-bit codes", note))
     return found
@@ -117,17 +128,22 @@ def direct_rows(scene: dict[str, Any], variant: str, quick: bool) -> list[Row]:
 
 def path_rows(scene: dict[str, Any], variant: str, quick: bool) -> list[Row]:
     """Mirror and glass by the path integrator, against a long run of another seed."""
-    reference = _compositor(scene, variant, 1, 128)
-    _passes(reference, 64 if quick else 512)
-    truth = _codes(reference.picture())
+    count = 16 if quick else 512
+
+    def converged() -> Picture:
+        reference = _compositor(scene, variant, 1, 128)
+        _passes(reference, count)
+        return reference.picture()
+
+    truth = codes(cached(f"path-{variant}", [code_version(), scene, count], converged))
     found: list[Row] = []
-    for spp in (4, 16) if quick else (4, 16, 64):
+    for spp in (4,) if quick else (4, 16, 64):
         job = _compositor(scene, variant, 0, spp)
         start = time.process_time()
         _passes(job, spp)
-        error = float(np.sqrt(np.mean((_codes(job.picture()) - truth) ** 2)))
+        error = rms(codes(job.picture()) - truth)
         seconds = time.process_time() - start
-        what = "composite 640x480, mirror and glass"
+        what = f"composite 640x480, {WORDS[variant]}"
         note = f"path integrator, {spp} samples"
         found.append(Row("renderer", what, "chromeball", seconds, error, "8-bit codes", note))
     return found
@@ -163,17 +179,136 @@ def bias_rows(scene: dict[str, Any], quick: bool) -> list[Row]:
     return found
 
 
-def load_rows(scene: dict[str, Any]) -> list[Row]:
-    """From files to the first composite: 200,000 triangles and a map of 1024 x 512."""
-    start = time.process_time()
+def mitsuba_rows(scene: dict[str, Any], variant: str, quick: bool) -> list[Row]:
+    """Tuned Mitsuba on the same scene, straight after ours."""
+    materials = scene["variants"][variant]
+    size, fov, pose = _camera(scene)
+    job = _compositor(scene, variant, 0, 16)
+    job.add(16)
+
+    def surface(kind: str, value: Any) -> peer.Entry:
+        match kind:
+            case "mirror":
+                conductor = {"type": "conductor", "material": "none"}
+                return conductor | {"specular_reflectance": peer.rgb(value)}
+            case "glass":
+                return {"type": "dielectric", "int_ior": value, "ext_ior": 1.0}
+            case _:
+                return peer.diffuse(value)
+
+    same = renderer_mitsuba.Scene(
+        f"composite 640x480, {WORDS[variant]}",
+        [_mesh(name, *materials[name]) for name in ("spot", "knot")],
+        [surface(*materials[name]) for name in ("spot", "knot")],
+        _mesh("floor", "diffuse", 0.4),
+        read_rgb(DATA / "hotel_room.exr"),
+        size,
+        fov,
+        pose,
+        read_rgb(DATA / "plate.exr"),
+        {"direct": 2, "diffuse": 3, "mg": 10}[variant],
+    )
+    return renderer_mitsuba.rows(same, job.result().alpha, quick)
+
+
+def load_rows() -> list[Row]:
+    """From files to the first composite in a fresh process, Python's imports apart."""
+    found: list[Row] = []
+    for cores in (1, 2):
+        code = "from chromeball.bench.renderer import first_composite; first_composite()"
+        done = subprocess.run(
+            ["taskset", "-c", ",".join(map(str, sorted(os.sched_getaffinity(0))[:cores]))]
+            + [sys.executable, "-c", code],
+            check=True,
+            capture_output=True,
+            text=True,
+        )
+        told = json.loads(done.stdout)
+        note = (
+            f"{cores} core(s), {told['wall']:.2f} s by the clock, of the CPU "
+            f"{told['built']:.2f} s until the scene stands; memory grows by "
+            f"{told['grown']:.0f} MB over {told['imports']:.0f} MB of Python and its imports; "
+            f"then {told['fps']:.1f} frames of 4 samples a second"
+        )
+        what = "files to first composite, 200,000 triangles, fresh process"
+        found.append(Row("renderer", what, "chromeball", told["cpu"], math.nan, "", note))
+    return found
+
+
+def first_composite() -> None:
+    """What a fresh process needs for its first composite, as JSON on stdout."""
+    scene: dict[str, Any] = json.loads((DATA / "scene.json").read_text())
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    cpu, wall = time.process_time(), time.perf_counter()
     job = _compositor(scene, "direct", 0, 4, integrator="direct")
-    built = time.process_time() - start
+    built = time.process_time() - cpu
     job.add(4)
     job.picture()
-    seconds = time.process_time() - start
-    note = f"of that {built:.2f} s until the scene stands"
-    what = "files to first composite, 200,000 triangles"
-    return [Row("renderer", what, "chromeball", seconds, math.nan, "", note)]
+    cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
+    after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    fps = 1 / min(_frame(job, 4)[1] for _ in range(5))
+    told = {"cpu": cpu, "wall": wall, "built": built, "fps": fps}
+    print(json.dumps(told | {"grown": (after - before) / 1024, "imports": before / 1024}))
+
+
+def _frame(job: Compositor, samples: int) -> tuple[float, float]:
+    """CPU seconds and seconds by the clock of one frame from nothing."""
+    cpu, wall = time.process_time(), time.perf_counter()
+    job.restart()
+    job.add(samples)
+    job.picture()
+    return time.process_time() - cpu, time.perf_counter() - wall
+
+
+def frame_rows(scene: dict[str, Any], quick: bool) -> list[Row]:
+    """Frames while an object moves, and the thesis's car: 32 light samples a pixel.
+
+    The frames a second are by the clock, on all cores that this process may use.
+    """
+    found: list[Row] = []
+    count = 5 if quick else 20
+    cores = len(os.sched_getaffinity(0))
+    for what, samples in (("interactive frame", 2), ("interactive frame", 3), ("car", 32)):
+        job = _compositor(scene, "direct", 0, samples, integrator="direct")
+        cpu: list[float] = []
+        wall: list[float] = []
+        for k in range(count):
+            pose = Pose(np.eye(3), np.array([0.002 * k, 0.0, 0.0]))
+            start = time.process_time(), time.perf_counter()
+            job.move(0, pose)
+            job.add(samples)
+            job.picture()
+            cpu.append(time.process_time() - start[0])
+            wall.append(time.perf_counter() - start[1])
+        note = (
+            f"{samples} samples, object moved each frame: {1 / min(wall):.1f} frames a "
+            f"second on {cores} cores at best, {1 / float(np.median(wall)):.1f} in the median"
+        )
+        title = {
+            "car": "the thesis's set-up: 200,000 triangles, 32 light samples, 640x480",
+            "interactive frame": "interactive frame, 640x480, 200,000 triangles",
+        }[what]
+        found.append(Row("renderer", title, "chromeball", min(cpu), math.nan, "", note))
+    return found
+
+
+def size_rows(scene: dict[str, Any], quick: bool) -> list[Row]:
+    """What a frame costs with the number of pixels."""
+    found: list[Row] = []
+    for share in (0.25, 0.5, 1.0) if quick else (0.25, 0.5, 1.0, 2.0, 4.0):
+        view = scene["camera"] | {
+            "width": int(640 * share),
+            "height": int(480 * share),
+        }
+        smaller = scene | {"camera": view}
+        plate = np.full((view["height"], view["width"], 3), 0.3, np.float32)
+        job = _compositor(smaller, "direct", 0, 4, integrator="direct", plate=plate)
+        seconds = min(_frame(job, 4)[0] for _ in range(3))
+        pixels = view["width"] * view["height"]
+        note = f"4 samples, {seconds / pixels * 1e9:.0f} ns a pixel"
+        what = f"one frame, {pixels:,} pixels"
+        found.append(Row("renderer", what, "chromeball", seconds, math.nan, "", note))
+    return found
 
 
 def triangle_rows(scene: dict[str, Any], quick: bool) -> list[Row]:
@@ -203,15 +338,19 @@ def _passes(job: Compositor, samples: int) -> None:
         job.refine(min(16, samples - job.samples))
 
 
-def _codes(rgb: NDArray[np.float32]) -> NDArray[Any]:
-    return 255 * srgb_encode(np.clip(rgb, 0, 1))
-
-
 def _mesh(name: str, kind: str, value: Any) -> Mesh:
     vertices, faces, _ = read_mesh(DATA / f"{name}.ply")
     color, ior = (value, 1.5) if kind != "glass" else (1.0, value)
     turned = (vertices @ TURN.T).astype(np.float32)
     return Mesh.of(turned, faces, color, kind=Kind[kind.upper()], ior=ior)
+
+
+def _camera(scene: dict[str, Any]) -> tuple[tuple[int, int], float, Pose]:
+    view = scene["camera"]
+    size = (int(view["width"]), int(view["height"]))
+    pose = Pose.look_at(TURN @ np.array(view["position"]), TURN @ np.array(view["target"]))
+    fov = 2 * math.atan(math.tan(math.radians(view["vfov_deg"]) / 2) * size[0] / size[1])
+    return size, fov, pose
 
 
 def _compositor(
@@ -223,13 +362,10 @@ def _compositor(
     integrator: Integrator = "path",
     filtered: bool = True,
     objects: list[Mesh] | None = None,
+    plate: Picture | None = None,
 ) -> Compositor:
     materials = scene["variants"][variant]
-    view = scene["camera"]
-    size = (int(view["width"]), int(view["height"]))
-    place = TURN @ np.array(view["position"])
-    pose = Pose.look_at(place, TURN @ np.array(view["target"]))
-    fov = 2 * math.atan(math.tan(math.radians(view["vfov_deg"]) / 2) * size[0] / size[1])
+    size, fov, pose = _camera(scene)
     ground = _mesh("floor", "diffuse", 0.4)
     surface = np.full(len(ground.faces), SUPPORT, np.uint8)
     floor = StandInMesh(ground.vertices, ground.vertices, ground.faces, surface)
@@ -240,8 +376,8 @@ def _compositor(
         objects,
         captured,
         corner_rays(CameraModel.pinhole(size, fov, pose)),
-        place,
-        read_rgb(DATA / "plate.exr"),
+        pose.translation,
+        read_rgb(DATA / "plate.exr") if plate is None else plate,
         bounces=min(int(materials["indirect_bounces"]), 4),
         seed=seed,
         samples=samples,
