@@ -1,7 +1,7 @@
 """The renderer's scenes in tuned Mitsuba 3, two pictures each: with the objects and without.
 
 Tuned is ``multijitter`` and ``mis_compensation``; its defaults need several times as long. The
-composite is plate + (with - without) on the floor and the picture itself on the objects, told
+composite is plate with / without on the floor, our quotient, and the picture itself on the objects, told
 apart by the coverage that our own composite has. Mitsuba's map has no place, and its floor a
 reflectance in the place of captured radiance: it has the simpler problem, so that each tool is
 held against its own converged picture.
@@ -92,7 +92,7 @@ class Pair:
             import pyoidn
 
             with_, without = (pyoidn.denoise(p, hdr=True) for p in (with_, without))
-        floor = self._plate + (with_ - without)
+        floor = self._plate * (with_ / np.maximum(without, 1e-6))
         found = self._alpha * with_ + (1 - self._alpha) * floor
         return np.maximum(found, 0).astype(np.float32)
 
@@ -110,7 +110,16 @@ def rows(scene: Scene, alpha: Picture, quick: bool) -> list[Row]:
         pictures = [pair.composite(each, 1000 + k) for k in range(passes)]
         return np.array([np.mean(pictures[k::2], axis=0) for k in (0, 1)], np.float32)
 
-    key = [mi.__version__, name, scene.what, scene.depth, passes * each, alpha, scene.plate]
+    key: list[Any] = [
+        Path(__file__).read_text(),
+        mi.__version__,
+        name,
+        scene.what,
+        scene.depth,
+        passes * each,
+        alpha,
+        scene.plate,
+    ]
     key += [a for m in scene.objects for a in (m.vertices, m.faces)] + [scene.sky]
     first, second = cached(f"mitsuba-{scene.what}", key + [repr(scene.surfaces)], halves)
     truth, noise = codes((first + second) / 2), rms(codes(first) - codes(second)) / 2
