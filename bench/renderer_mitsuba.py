@@ -1,10 +1,10 @@
 """The renderer's scenes in tuned Mitsuba 3, two pictures each: with the objects and without.
 
 Tuned is ``multijitter`` and ``mis_compensation``; its defaults need several times as long. The
-composite is plate with / without on the floor, our quotient, and the picture itself on the objects, told
-apart by the coverage that our own composite has. Mitsuba's map has no place, and its floor a
-reflectance in the place of captured radiance: it has the simpler problem, so that each tool is
-held against its own converged picture.
+composite is plate with / without on the floor, our quotient, and the picture itself on the
+objects, told apart by the coverage that our own composite has. Mitsuba's map has no place, and
+its floor a reflectance in the place of captured radiance: it has the simpler problem, so that
+each tool is held against its own converged picture.
 """
 
 from __future__ import annotations
