@@ -389,6 +389,7 @@ void Direct::Tile::add_set(FilmTile& film) {
       film.set.variance[at] += m * m * (1 - asked.part);  // others go without
     }
     film.set.r[at] += q.x, film.set.g[at] += q.y, film.set.b[at] += q.z;
+    film.has_change |= !is_zero(q);
   }
 }
 
@@ -576,6 +577,7 @@ void Direct::Tile::add_samples(FilmTile& film) {
     if (s.on_object) {
       const Vec3 albedo = (w / kPi) * s.factor, lit = albedo * s.value;
       FilmTile::Layer& objects = film.objects;
+      film.has_objects = true;
       objects.share[at] += w;
       objects.r[at] += lit.x, objects.g[at] += lit.y, objects.b[at] += lit.z;
       objects.nx[at] += w * s.n.x, objects.ny[at] += w * s.n.y, objects.nz[at] += w * s.n.z;
@@ -593,6 +595,7 @@ void Direct::Tile::add_samples(FilmTile& film) {
       if (!support && is_zero(q)) continue;
       film.set.share[at] += w;
       film.set.group[at] = support ? float(s.group + 1) : -1;
+      film.has_change |= !is_zero(q);
       film.set.r[at] += w * q.x, film.set.g[at] += w * q.y, film.set.b[at] += w * q.z;
       const float f = mean(s.factor);
       on_set_[s.at].add(f * mean(s.value), f * f * s.square, s.rays);

@@ -1,21 +1,19 @@
 #include "filter.h"
 
 #include <algorithm>
+#include <iterator>
 
 namespace chromeball {
 
-// Means over the passes, with an apron of the neighbours; whether there is anything.
-bool Filter::load(const FilmTile* const (&around)[9], bool objects, int passes) {
-  bool any = false;
+// Means over the passes, with an apron of the neighbours.
+void Filter::load(const FilmTile* const (&around)[9], bool objects, int passes) {
   for (int y = 0; y < kSide; ++y) {
     const int down = y - kApron + kTile;
     for (int x = 0; x < kSide;) {  // from tile to tile
       const int across = x - kApron + kTile, from = across % kTile;
-      const int count = std::min(kTile - from, kSide - x);
-      const FilmTile* tile = around[down / kTile * 3 + across / kTile];
-      const int at = y * kSide + x;
-      if (tile) {
-        any |= load(*tile, objects, down % kTile * kTile + from, count, at, passes);
+      const int count = std::min(kTile - from, kSide - x), at = y * kSide + x;
+      if (const FilmTile* tile = around[down / kTile * 3 + across / kTile]) {
+        load(*tile, objects, down % kTile * kTile + from, count, at, passes);
       } else {
         for (float* to : {v_[0], v_[1], v_[2], n_[0], n_[1], n_[2], variance_, share_, group_}) {
           std::fill_n(to + at, count, 0.0f);
@@ -24,42 +22,51 @@ bool Filter::load(const FilmTile* const (&around)[9], bool objects, int passes) 
       x += count;
     }
   }
-  return any;
 }
 
 // `count` pixels of a tile in a row, from i on.
-bool Filter::load(const FilmTile& tile, bool objects, int i, int count, int at, int passes) {
+void Filter::load(const FilmTile& tile, bool objects, int i, int count, int at, int passes) {
   const FilmTile::Layer& layer = objects ? tile.objects : tile.set;
   const float per_pass = 1 / float(passes);
-  const float* const sums[3] = {layer.r, layer.g, layer.b};
-  float most = 0;
+  const float* const shares = layer.share + i;
+  float* const share = share_ + at;
+  float* const variance = variance_ + at;
+#pragma GCC ivdep
   for (int k = 0; k < count; ++k) {
-    const float share = layer.share[i + k];
-    most = std::max(most, share);
-    share_[at + k] = share * per_pass;
-    group_[at + k] = layer.group[i + k];
-    variance_[at + k] = share > 0 ? layer.variance[i + k] * per_pass * per_pass : 0.0f;
+    share[k] = shares[k] * per_pass;
+    variance[k] = shares[k] > 0 ? layer.variance[i + k] * per_pass * per_pass : 0.0f;
   }
+  std::copy_n(layer.group + i, count, group_ + at);
+  const float* const sums[3] = {layer.r, layer.g, layer.b};
   for (int c = 0; c < 3; ++c) {
-    const float* const base = objects ? tile.albedo[c] : layer.share;
-    for (int k = 0; k < count; ++k) {
-      v_[c][at + k] = base[i + k] > 0 ? sums[c][i + k] / base[i + k] : 0.0f;
-    }
+    const float* const base = (objects ? tile.albedo[c] : layer.share) + i;
+    const float* const sum = sums[c] + i;
+    float* const v = v_[c] + at;
+#pragma GCC ivdep
+    for (int k = 0; k < count; ++k) v[k] = base[k] > 0 ? sum[k] / base[k] : 0.0f;
   }
-  if (objects && most > 0) {
-    for (int k = 0; k < count; ++k) {
-      const float x = layer.nx[i + k], y = layer.ny[i + k], z = layer.nz[i + k];
-      const float l = std::sqrt(x * x + y * y + z * z), inverse = l > 0 ? 1 / l : 0.0f;
-      n_[0][at + k] = x * inverse, n_[1][at + k] = y * inverse, n_[2][at + k] = z * inverse;
-    }
-  } else {
-    for (float* n : n_) std::fill_n(n + at, count, 0.0f);
+  if (!objects) return;
+  const float *const nx = layer.nx + i, *const ny = layer.ny + i, *const nz = layer.nz + i;
+#pragma GCC ivdep
+  for (int k = 0; k < count; ++k) {
+    const float l = std::sqrt(nx[k] * nx[k] + ny[k] * ny[k] + nz[k] * nz[k]);
+    const float inverse = l > 0 ? 1 / l : 0.0f;
+    n_[0][at + k] = nx[k] * inverse;
+    n_[1][at + k] = ny[k] * inverse;
+    n_[2][at + k] = nz[k] * inverse;
   }
-  return most > 0;
 }
 
 void Filter::run(const FilmTile* const (&around)[9], bool objects, int passes, bool filter) {
-  if (load(around, objects, passes) && filter) {
+  const bool any = std::any_of(std::begin(around), std::end(around), [&](const FilmTile* tile) {
+    return tile && (objects ? tile->has_objects : tile->has_change);
+  });
+  if (!any) {
+    std::fill_n(out_[0], 4 * kTile * kTile, 0.0f);
+    return;
+  }
+  load(around, objects, passes);
+  if (filter) {
     objects ? smooth<true>(passes) : smooth<false>(passes);
     return;
   }

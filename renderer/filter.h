@@ -23,6 +23,7 @@ struct FilmTile {
   Plane albedo[3];       // diffuse
   Plane other[3];        // radiance of objects that is left alone
   Plane depth;
+  bool has_change = false, has_objects = false;  // whether the layers hold anything but 0
 };
 
 class Filter {
@@ -37,8 +38,8 @@ class Filter {
  private:
   static constexpr int kReach = 4, kMeans = 2;  // half windows: of the filter, of the means
   static constexpr int kApron = kReach + kMeans, kSide = kTile + 2 * kApron;
-  bool load(const FilmTile* const (&around)[9], bool objects, int passes);
-  bool load(const FilmTile& tile, bool objects, int i, int count, int at, int passes);
+  void load(const FilmTile* const (&around)[9], bool objects, int passes);
+  void load(const FilmTile& tile, bool objects, int i, int count, int at, int passes);
   template <bool kGuided>
   void smooth(int passes);
 
