@@ -23,11 +23,18 @@ float Direct::Tile::turn(int at, int across, int down) const {
   return (float(kOrder[(p.y + down) % 4 * 4 + (p.x + across) % 4]) + 0.5f) / 16;
 }
 
+// Of a sequence that fills the square evenly, another one for each pixel of 4 x 4 and each seed.
+Pair Direct::Tile::spread_at(uint32_t i, float x, float y) const {
+  const Pair u = spread(i);
+  return {fraction(u.x + start_.x + x), fraction(u.y + start_.y + y), 0};
+}
+
 uint64_t Direct::Tile::shade(Direct& direct, const PixelRays& rays, Vec3 camera, int samples,
                              int x0, int y0) {
   direct_ = &direct, rays_ = &rays, camera_ = camera, samples_ = samples, x0_ = x0, y0_ = y0;
   traced_ = 0;
-  pass_turn_ = fraction(float(direct.passes_) * 0.618034f);
+  start_ = spread(uint32_t(direct.seed_ ^ direct.seed_ >> 32) * 2654435761u);
+  pass_turn_ = fraction(float(direct.passes_) * 0.618034f + start_.x);
   positional_ = direct.captured_.positional();
   const bool flat = positional_ && direct.captured_.flat();
   set_hides_ = positional_ && !flat;
@@ -109,9 +116,8 @@ void Direct::Tile::look_at_pixels() {
       const uint32_t count = uint32_t(subsamples(shows_[at]));
       for (uint32_t k = 0; k < count; ++k) {
         const uint32_t i = uint32_t(d.passes_) * count + k;
-        const Pair u = spread(i);
-        const Vec3 w = rays_->direction(p.y, p.x, fraction(u.x + turn(at)),
-                                        fraction(u.y + turn(at, 2, 1)));
+        const Pair u = spread_at(i, turn(at), turn(at, 2, 1));
+        const Vec3 w = rays_->direction(p.y, p.x, u.x, u.y);
         if (!is_finite(w)) continue;
         Sample s;
         s.at = at, s.d = w, s.i = i;
@@ -320,31 +326,32 @@ void Direct::Tile::light_set() {
   if (!direct_->gathers() && !lights) return;
   ShadowRays shadows(*direct_);
   GatherRays near(*direct_, shadows, nullptr), gather(*direct_, shadows, &near);
-  const Pair a = spread(uint32_t(direct_->passes_)), b = spread(3 * uint32_t(direct_->passes_) + 1);
+  const uint32_t rays = direct_->gathers() ? uint32_t(subsamples(Shows::inside)) : 0;
   for (int at = 0; at < kPixels; ++at) {
     if (!asks_[at]) continue;
     const Vec3 x{x_[at], y_[at], z_[at]}, n = direct_->normal_of(plane_[at]);
     if (lights) lit_[at] = delta_change(x, n, at);
-    if (!direct_->gathers()) continue;
-    look_at_objects(gather, x, n, {fraction(a.x + turn(at, 0, 1)), fraction(a.y + turn(at)), 0},
-                    fraction(turn(at, 1, 0) + pass_turn_),
-                    {fraction(b.x + turn(at, 3, 0)), fraction(b.y + turn(at, 2, 3)), 0},
-                    &sent_[at], &sent_square_[at]);
+    for (uint32_t k = 0; k < rays; ++k) {
+      const float lamp = fraction(turn(at, 1, 0) + pass_turn_ + 0.618034f * float(k));
+      look_at_objects(gather, x, n, at, uint32_t(direct_->passes_) * rays + k, lamp,
+                      1 / float(rays), &sent_[at], &sent_square_[at]);
+    }
   }
   gather.flush(), near.flush(), shadows.flush();
   traced_ += gather.traced + near.traced + shadows.traced;
 }
 
-// One ray towards the objects.
-void Direct::Tile::look_at_objects(GatherRays& gather, Vec3 x, Vec3 n, Pair u, float lamp, Pair v,
-                                   Vec3* sum, float* square) const {
+// One ray towards the objects, the i-th of a pixel.
+void Direct::Tile::look_at_objects(GatherRays& gather, Vec3 x, Vec3 n, int at, uint32_t i,
+                                   float lamp, float weight, Vec3* sum, float* square) const {
   const Vec3 start = x + clearance(x, camera_) * n;
   const Cones cones(start, n, direct_->scene_.bounds_);
   if (cones.empty()) return;
-  const Vec3 d = cones.sample(u);
+  const Vec3 d = cones.sample(spread_at(i, turn(at, 0, 1), turn(at)));
   const float cos = dot(d, n);
   if (cos <= 0) return;
-  gather.push(start, d, {sum, square, Vec3(cos / cones.density(d)), lamp, v, false});
+  const Pair v = spread_at(3 * i + 1, turn(at, 3, 0), turn(at, 2, 3));
+  gather.push(start, d, {sum, square, Vec3(weight * cos / cones.density(d)), lamp, v, false});
 }
 
 FilmTile* Direct::Tile::film() {
@@ -374,8 +381,12 @@ void Direct::Tile::add_set(FilmTile& film) {
     film.set.group[at] = float(plane_[k] + 1);
     const Vec3 inverse{inverse_[0][k], inverse_[1][k], inverse_[2][k]};
     Vec3 q = inverse * (sent_[k] + lit_[k]);
-    const float noisy = mean(inverse * sent_[k]);
-    film.set.variance[at] += noisy * noisy;
+    const float sent = mean(inverse * sent_[k]), scale = mean(inverse);
+    const float rays = float(subsamples(Shows::inside));
+    film.set.variance[at] +=
+        rays > 1 ? std::max(scale * scale * sent_square_[k] - sent * sent / rays, 0.0f) *
+                       rays / (rays - 1)
+                 : sent * sent;
     if (!g.choices.empty()) {
       const Asked asked = this->asked(g);
       const float n = float(asked.rays), all = 1 / (n * asked.part);
@@ -524,12 +535,11 @@ void Direct::Tile::shade_object(Sample& s, ShadowRays& shadows, GatherRays& gath
   }
   // what is near in the set, and what objects and set send each other
   if (!positional_ && !d.gathers()) return;
-  const Pair a = spread(s.i), b = spread(3 * s.i + 1);
-  const Vec3 w = Frame(s.n).world(
-      sample_cosine(fraction(a.x + turn(s.at, 1, 0)), fraction(a.y + turn(s.at, 0, 2))));
+  const Pair u = spread_at(s.i, turn(s.at, 1, 0), turn(s.at, 0, 2));
+  const Vec3 w = Frame(s.n).world(sample_cosine(u.x, u.y));
   if (dot(w, surface.ng) <= 0) return;
   const float lamp = fraction(shift + 0.618034f * float(s.rank) + 0.5f);
-  const Pair v{fraction(b.x + turn(s.at, 3, 0)), fraction(b.y + turn(s.at, 2, 3)), 0};
+  const Pair v = spread_at(3 * s.i + 1, turn(s.at, 3, 0), turn(s.at, 2, 3));
   gather.push(start, w, {&s.value, &s.square, Vec3(kPi), lamp, v, true});
 }
 
@@ -557,12 +567,8 @@ void Direct::Tile::shade_set(Sample& s, ShadowRays& shadows, GatherRays& gather)
   }
   if (!d.scene_.objects_->delta_lights().empty()) s.other += delta_change(x, g.normal, s.at);
   if (!d.gathers()) return;
-  const Pair a = spread(s.i), b = spread(3 * s.i + 1);
-  look_at_objects(gather, x, g.normal,
-                  {fraction(a.x + turn(s.at, 0, 1)), fraction(a.y + turn(s.at)), 0},
-                  fraction(turn(s.at, 1, 0) + pass_turn_ + 0.618034f * float(s.rank)),
-                  {fraction(b.x + turn(s.at, 3, 0)), fraction(b.y + turn(s.at, 2, 3)), 0},
-                  &s.other, &s.square);
+  look_at_objects(gather, x, g.normal, s.at, s.i,
+                  fraction(shift + 0.618034f * float(s.rank) + 0.25f), 1, &s.other, &s.square);
 }
 
 void Direct::Tile::add_samples(FilmTile& film) {

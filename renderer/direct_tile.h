@@ -110,16 +110,18 @@ class Direct::Tile {
   void add_samples(FilmTile& film);
 
   Vec3 irradiance(uint32_t face, Vec3 x, uint32_t plane) const;
-  void look_at_objects(GatherRays& gather, Vec3 x, Vec3 n, Pair u, float lamp, Pair v, Vec3* sum,
-                       float* square) const;
+  void look_at_objects(GatherRays& gather, Vec3 x, Vec3 n, int at, uint32_t i, float lamp,
+                       float weight, Vec3* sum, float* square) const;
   Vec3 delta_change(Vec3 x, Vec3 n, int at);
   float turn(int at, int across = 0, int down = 0) const;
+  Pair spread_at(uint32_t i, float x, float y) const;
 
   Direct* direct_ = nullptr;
   const PixelRays* rays_ = nullptr;
   Vec3 camera_;
   int samples_ = 0, x0_ = 0, y0_ = 0;
   uint64_t traced_ = 0;
+  Pair start_{};  // of sequences: another for each seed
   float pass_turn_ = 0;
   bool positional_ = false;
   bool set_hides_ = false;  // the set may keep light from what is above it
