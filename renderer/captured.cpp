@@ -4,6 +4,19 @@
 #include <tbb/parallel_for.h>
 
 namespace chromeball {
+namespace {
+
+// The k-th of `count` numbers that are stratified along the map's curve, and one for the way
+// across it: both together fill each texel evenly, by a lattice of the golden ratio.
+Pair along_curve(uint32_t k, uint32_t count, uint64_t seed) {
+  const uint32_t stratum = uint32_t((uint64_t(1) << 32) / count);
+  const uint64_t start = mix64(seed), jitter = mix64(start + k);
+  const uint32_t bits = k * stratum + uint32_t(jitter) % stratum;
+  const uint32_t across = k * 2654435769u + uint32_t(start >> 32);
+  return {float(bits >> 8) * 0x1p-24f, float(across >> 8) * 0x1p-24f, bits};
+}
+
+}  // namespace
 
 Captured::Captured(const StandIn& stand_in, const Environment& environment, Vec3 origin,
                    uint64_t seed)
@@ -103,11 +116,9 @@ std::vector<Lamp> Captured::lamps(uint32_t count, uint64_t seed) const {
                  stand_in_.faces.data(), stand_in_.size());
   }
   original.commit();
-  const uint32_t stratum = uint32_t((uint64_t(1) << 32) / count);
   for (uint32_t k = 0; k < count; ++k) {
-    const uint64_t h = mix64(seed + k);
-    const auto s =
-        environment_.sample_power(k * stratum + uint32_t(h) % stratum, float(h >> 40) * 0x1p-24f);
+    const Pair u = along_curve(k, count, seed);
+    const auto s = environment_.sample_power(u.bits, u.y);
     Lamp& lamp = lamps[k];
     lamp.place = s.direction;
     lamp.flux = environment_.radiance(s.direction) * (1 / (s.density * float(count)));
@@ -133,10 +144,8 @@ std::vector<Lamp> Captured::lamps(uint32_t count, uint64_t seed) const {
 }
 
 Captured::Light Captured::draw(uint32_t k, uint64_t seed) const {
-  const uint64_t h = mix64(seed + k);
-  const uint32_t stratum = uint32_t((uint64_t(1) << 32) / kLights);
-  const uint32_t bits = k * stratum + uint32_t(h) % stratum;
-  const Environment::Sample s = environment_.sample(bits, float(h >> 40) * 0x1p-24f);
+  const Pair u = along_curve(k, kLights, seed);
+  const Environment::Sample s = environment_.sample(u.bits, u.y);
   return laid(s.direction, s.texel, s.density);
 }
 

@@ -88,9 +88,11 @@ const LightLists::List& Direct::list(uint32_t owner, uint32_t bin) const {
     const Vec3 n = set ? plane_normal_[bin / 2] * (bin & 1 ? -1.0f : 1.0f)
                        : LightLists::middle_of(bin);
     const Sphere& around = owners_[owner];
-    lazy.list = set ? lights_.draw(around.centre, around.radius, n, 0, kFloorLamps, 0.5f)
+    const uint64_t number = uint64_t(owner) * LightLists::kBins + bin;
+    const float u = float(mix64(mix64(seed_ + uint64_t(epoch_)) + number) >> 40) * 0x1p-24f;
+    lazy.list = set ? lights_.draw(around.centre, around.radius, n, 0, kFloorLamps, u)
                     : lights_.draw(around.centre, around.radius, n, LightLists::kSlack,
-                                   kObjectLamps, 0.5f);
+                                   kObjectLamps, u);
   });
   return lazy.list;
 }
@@ -130,7 +132,8 @@ void Direct::begin(int height, int width) {
   height_ = height, width_ = width, passes_ = 0;
   draw_lamps(0);
   const size_t n = size_t(height) * width, tiles = size_t(tiles_down()) * tiles_across();
-  distance_.resize(n), face_.resize(n), object_.resize(n), object_distance_.resize(n);
+  distance_.resize(n), face_.resize(n), object_distance_.resize(n);
+  object_.assign(n, 0);
   film_.resize(tiles);
   touched_.assign(tiles, 0);
 }
@@ -187,7 +190,6 @@ uint64_t Direct::find_surfaces(const PixelRays& rays, Vec3 camera, Pair at, int 
         const bool met = packet.valid[k] && packet.hits(k);
         face_[pixel] = met ? packet.rays.hit.primID[k] : kNowhere;
         distance_[pixel] = met ? packet.rays.ray.tfar[k] : kInfinity;
-        object_[pixel] = 0;
         packet.forget_hit(k);
       }
       if (!objects || !count) continue;
@@ -195,6 +197,7 @@ uint64_t Direct::find_surfaces(const PixelRays& rays, Vec3 camera, Pair at, int 
       for (int k = 0; k < 16; ++k) {
         if (packet.valid[k] && packet.hits(k)) {
           const size_t pixel = size_t(y + (k >> 2)) * width_ + x + (k & 3);
+          if (object_[pixel]) continue;
           object_[pixel] = uint8_t(1 + packet.hit(k).instance % 255);
           object_distance_[pixel] = packet.rays.ray.tfar[k];
         }

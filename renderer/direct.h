@@ -82,7 +82,9 @@ class Direct {
   uint64_t seed_;
   std::vector<float> distance_;   // of the stand-in through the pixel's middle, this pass
   std::vector<uint32_t> face_;
-  std::vector<uint8_t> object_;   // which object the middle meets, 0: none; large numbers wrap
+  // Which object was first met in a pixel, 0: none so far; large numbers wrap. What one pass finds
+  // must not choose how that pass samples: pixels seen from the object's side would count more.
+  std::vector<uint8_t> object_;
   std::vector<float> object_distance_;
   std::vector<std::unique_ptr<FilmTile>> film_;
   std::vector<uint8_t> touched_;  // of each tile, over all passes: its film counts
