@@ -147,12 +147,12 @@ def test_all_shadow_of_a_ball_near_the_floor() -> None:
     r, h, even = 0.3, 0.31, np.ones((16, 32, 3), np.float32)
     view = view_from((0.0, 1.4, 1.9))
     corners, eye = corner_rays(view), np.asarray(view.world_from_camera.translation)
-    u = (np.arange(8)[:, None, None, None] + 0.5) / 8
+    u = (np.arange(8)[:, None, None, None, None] + 0.5) / 8
     v = (np.arange(8)[None, :, None, None, None] + 0.5) / 8
     above = (1 - u) * corners[:-1, :-1] + u * corners[:-1, 1:]
     below = (1 - u) * corners[1:, :-1] + u * corners[1:, 1:]
     d = (1 - v) * above + v * below
-    x = eye - eye[1] / d[..., 1:] * d
+    x = eye - eye[1] / d[..., 1:2] * d
     distance = np.linalg.norm(np.array([0, h, 0]) - x, axis=-1)
     blocked = ((r / distance) ** 2 * h / distance).mean(axis=(0, 1))
     ratios: list[float] = []
