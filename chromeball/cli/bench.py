@@ -8,13 +8,16 @@ import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
 from chromeball.bench.row import Row
 from chromeball.scene.errors import UserError
 from chromeball.scene.record import atomic_output, write_json, write_text
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 #: in the order of the pipeline; each is a module of `chromeball.bench`
 STAGES = ("acquire", "hdr", "calibrate", "envmap", "stand_in", "renderer")
@@ -38,7 +41,7 @@ def bench(
 ) -> None:
     """Measure each stage's CPU time against its error, beside its peers, in one run.
 
-    Writes table.md, table.json and a plot for each stage.
+    Writes table.md, table.json and a plot for each stage: errors, and curves of the cost.
 
     Parameters
     ----------
@@ -113,52 +116,68 @@ def as_markdown(rows: Sequence[Row], skips: Sequence[Skip], *, quick: bool) -> s
 
 
 def plot_stage(stage: str, rows: Sequence[Row], output: Path) -> Path | None:
-    """Plot time against error of one stage, a panel a task, or nothing without a pair of them.
+    """Plot time against error of one stage, a panel a task, then its curves; or nothing.
 
-    Both axes are logarithmic, so that a row of zero or unknown error has no place in it.
+    All axes are logarithmic, so that a row of zero or unknown error has no place in it.
     """
-    mine = [row for row in rows if row.stage == stage and row.cpu_seconds > 0 and row.error > 0]
-    tasks = list(dict.fromkeys(row.what for row in mine if math.isfinite(row.error)))
-    if not tasks:
+    mine = [row for row in rows if row.stage == stage]
+    pairs = [r for r in mine if r.cpu_seconds > 0 and r.error > 0 and math.isfinite(r.error)]
+    panels = [(what, False) for what in dict.fromkeys(row.what for row in pairs)]
+    panels += [(what, True) for what in dict.fromkeys(r.what for r in mine if r.point)]
+    if not panels:
         return None
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    columns = min(3, len(tasks))
-    lines = math.ceil(len(tasks) / columns)
+    columns = min(3, len(panels))
+    lines = math.ceil(len(panels) / columns)
     figure = Figure(figsize=(4.4 * columns, 3.6 * lines), layout="constrained")
     FigureCanvasAgg(figure)
-    for i, task in enumerate(tasks):
+    for i, (what, is_curve) in enumerate(panels):
         axes = figure.add_subplot(lines, columns, i + 1)
-        here = [row for row in mine if row.what == task and math.isfinite(row.error)]
-        for row in here:
-            ours = row.tool.startswith("chromeball")
-            axes.loglog(
-                row.cpu_seconds,
-                row.error,
-                marker="o" if ours else "s",
-                markersize=9 if ours else 7,
-                color="#3f6f8f" if ours else "#b0aaa0",
-                linestyle="none",
-            )
-            axes.annotate(
-                row.tool,
-                (row.cpu_seconds, row.error),
-                xytext=(7, 5),
-                textcoords="offset points",
-                fontsize=8,
-            )
-        axes.set_title(task, fontsize=9, loc="left")
-        axes.set_xlabel("CPU s")
-        axes.set_ylabel(f"error, {here[0].unit}")
+        if is_curve:
+            _plot_curve(axes, [row for row in mine if row.what == what])
+        else:
+            _plot_errors(axes, [row for row in pairs if row.what == what])
+        axes.set_title(what, fontsize=9, loc="left")
         axes.grid(which="major", color="#e3e0da", linewidth=0.8)
         axes.set_axisbelow(True)
         axes.spines[["top", "right"]].set_visible(False)
-        axes.margins(0.35)
     path = output / f"{stage}.png"
     with atomic_output(path) as temporary:
         figure.savefig(temporary, dpi=120)
     return path
+
+
+def _plot_errors(axes: Axes, rows: Sequence[Row]) -> None:
+    """Time against error: a line a tool, its name at the first point."""
+    for tool in dict.fromkeys(row.tool for row in rows):
+        points = sorted((row.cpu_seconds, row.error) for row in rows if row.tool == tool)
+        ours = tool.startswith("chromeball")
+        axes.loglog(
+            *zip(*points, strict=True),
+            marker="o" if ours else "s",
+            markersize=9 if ours else 7,
+            color="#3f6f8f" if ours else "#b0aaa0",
+            linewidth=1,
+            linestyle="--" if "+" in tool else "-",
+        )
+        axes.annotate(tool, points[0], xytext=(7, 5), textcoords="offset points", fontsize=8)
+    axes.set_xlabel("CPU s")
+    axes.set_ylabel(f"error, {rows[0].unit}")
+    axes.margins(0.35)
+
+
+def _plot_curve(axes: Axes, rows: Sequence[Row]) -> None:
+    """Time along a curve, a line a tool."""
+    for tool in dict.fromkeys(row.tool for row in rows):
+        points = [row.point for row in rows if row.tool == tool and row.point]
+        axes.loglog(
+            [p.at for p in points], [p.seconds for p in points], marker="o", color="#3f6f8f"
+        )
+        axes.set_xlabel(points[0].along)
+        axes.set_ylabel(points[0].clock)
+    axes.margins(0.15)
 
 
 def _chosen(names: Sequence[str]) -> list[str]:
