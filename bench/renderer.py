@@ -11,6 +11,7 @@ import hashlib
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from chromeball.bench.race import Picture, Runner, Truth, converged, race
 from chromeball.bench.renderer_scenes import WORDS, Setting, hotel, outdoors, room
 from chromeball.bench.row import Row
 from chromeball.renderer import core
-from chromeball.renderer.composite import Compositor, Integrator
+from chromeball.renderer.composite import Compositor
 from chromeball.renderer.denoise import denoise
 from chromeball.scene.errors import UserError
 
@@ -36,7 +37,7 @@ def rows(quick: bool) -> list[Row]:
     found += renderer_cost.rows(still, _truth(still, "direct", quick), quick)
     for setting in (still, hotel("diffuse"), outdoors(), room()):
         found += _direct_rows(setting, quick)
-    found += _path_rows(hotel("mg"), (2, 4) if quick else (2, 4, 8, 16), quick)
+    found += _path_rows(hotel("mg"), (4,) if quick else (2, 4, 8, 16), quick)
     for setting in (outdoors(), room()):
         found += _path_rows(setting, (4,) if quick else (4, 16, 64), quick)
     return found + _bias_rows(quick)
@@ -108,21 +109,19 @@ def _bias_rows(quick: bool) -> list[Row]:
     return found
 
 
-def _truth(setting: Setting, integrator: Integrator, quick: bool) -> Truth:
+def _truth(setting: Setting, integrator: Literal["direct", "path"], quick: bool) -> Truth:
     """Our own picture after many samples, not filtered."""
-    if integrator == "direct":
-        samples = 16 if quick else 128
-    else:
-        samples = 4 if quick else 64
+    samples = {"direct": 16, "path": 4} if quick else {"direct": 128, "path": 64}
+    count = samples[integrator]
 
     def half(seed: int) -> Picture:
-        job = setting.job(seed, samples, integrator=integrator, filtered=False)
-        _sample(job, samples)
+        job = setting.job(seed, count, integrator=integrator, filtered=False)
+        _sample(job, count)
         return job.picture()
 
     library = Path(str(core.__file__)).read_bytes()
     scenes = Path(str(renderer_scenes.__file__)).read_bytes()
-    key = [hashlib.sha256(library).digest(), scenes, samples, _PASS]
+    key = [hashlib.sha256(library).digest(), scenes, count, _PASS]
     return converged(f"{integrator}-{setting.name()}", key, half)
 
 

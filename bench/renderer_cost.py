@@ -107,7 +107,7 @@ def _frame_rows(setting: Setting, truth: Truth, quick: bool) -> list[Row]:
     has the object where the converged picture has it.
     """
     found: list[Row] = []
-    count, cores = 10 if quick else 40, len(os.sched_getaffinity(0))
+    count, cores = 5 if quick else 40, len(os.sched_getaffinity(0))
     car = 32 // _RAYS_A_SAMPLE
     for title, samples in (
         ("interactive frame, 640x480, 200,000 triangles", 1),
