@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import math
 import sys
+import textwrap
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -139,7 +140,8 @@ def plot_stage(stage: str, rows: Sequence[Row], output: Path) -> Path | None:
             _plot_curve(axes, [row for row in mine if row.what == what])
         else:
             _plot_errors(axes, [row for row in pairs if row.what == what])
-        axes.set_title(what, fontsize=9, loc="left")
+        axes.set_title(textwrap.fill(what, 48), fontsize=9, loc="left")
+        axes.tick_params(axis="x", which="minor", labelsize=6, labelrotation=45)
         axes.grid(which="major", color="#e3e0da", linewidth=0.8)
         axes.set_axisbelow(True)
         axes.spines[["top", "right"]].set_visible(False)
