@@ -92,6 +92,14 @@ class Captured {
   // Of a place from the map's origin.
   float distance(const Place& place) const { return length(place.captured_at - origin_); }
 
+  // Whether the list of lamps holds what a ray of direction d meets, if it is not too near: what
+  // the map shows. It does not where another part of the set stands before the place, or where
+  // the set stands in that direction and the ray passes it by.
+  bool is_listed(const Place& place, Vec3 d) const {
+    if (!place) return !positional() || !accel_.occluded(origin_, d, kInfinity);
+    return flat_ || !accel_.occluded(origin_, place.captured_at - origin_, 1 - 1e-3f);
+  }
+
   // L_cap: the radiance that the map holds for a place, or for a direction to infinity.
   Vec3 radiance(const Place& place, Vec3 d) const;
 

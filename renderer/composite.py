@@ -20,7 +20,7 @@ from chromeball.renderer import core
 from chromeball.renderer.delta_light import DeltaLight
 from chromeball.renderer.lens import Lens
 from chromeball.renderer.mesh import Instance, Mesh, Values, affine
-from chromeball.renderer.world import moved_back, triple, world
+from chromeball.renderer.world import check_reach, extent, moved_back, triple, world
 from chromeball.scene.errors import UserError
 from chromeball.scene.pose import Pose
 from chromeball.stand_in.ply import StandInMesh
@@ -219,7 +219,7 @@ class Compositor:
         self._difference = mode == "difference"
         self._environment = np.ascontiguousarray(captured.environment, np.float32)
         self._plate_samples = plate_samples
-        self._inner = _inner(objects)
+        self._inner, self._extents = _inner(objects), _extents(objects)
         self._lights = lights
         #: the core counts from the map's place
         self._about = np.asarray(captured.origin, float)
@@ -289,7 +289,7 @@ class Compositor:
             world(objects, self._lights if lights is None else lights, self._about)
         )
         self._lights = self._lights if lights is None else lights
-        self._inner = _inner(objects)
+        self._inner, self._extents = _inner(objects), _extents(objects)
         self._moved()
 
     def move(self, k: int, pose: Pose, scale: Values = 1.0) -> None:
@@ -297,10 +297,11 @@ class Compositor:
 
         `pose` and `scale` (one factor or three) apply to the mesh's vertices, as in
         :class:`Instance`, whose ``inner`` stays. Raises IndexError where there is no such
-        object.
+        object, UserError for a place 1e8 m away.
         """
-        matrix = affine(pose, scale, self._inner[k])
-        self._core.move(k, moved_back(matrix, self._about)[None])
+        step = moved_back(affine(pose, scale, self._inner[k]), self._about)[None]
+        check_reach(self._extents[k], step)
+        self._core.move(k, step)
         self._moved()
 
     def _moved(self) -> None:
@@ -499,6 +500,11 @@ def _float32(values: NDArray[np.floating]) -> NDArray[np.float32]:
 
 def _inner(objects: Sequence[Mesh | Instance]) -> list[NDArray[np.float64] | None]:
     return [thing.inner if isinstance(thing, Instance) else None for thing in objects]
+
+
+def _extents(objects: Sequence[Mesh | Instance]) -> list[NDArray[np.float64]]:
+    meshes = (thing.mesh if isinstance(thing, Instance) else thing for thing in objects)
+    return [extent(mesh.vertices) for mesh in meshes]
 
 
 def check_environment(environment: NDArray[np.float32]) -> None:

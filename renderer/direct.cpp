@@ -3,6 +3,9 @@
 #include <tbb/blocked_range.h>
 #include <tbb/parallel_for.h>
 
+#include <map>
+#include <tuple>
+
 #include "direct_tile.h"
 
 namespace chromeball {
@@ -16,14 +19,14 @@ Direct::Direct(const Compositor& scene, uint64_t seed)
   // large planes of the set get a list that is drawn for their very normal
   const StandIn& set = captured_.stand_in();
   plane_of_.resize(set.size());
+  std::map<std::tuple<long, long, long>, uint32_t> known;  // of rounded normals
   for (uint32_t f = 0; f < set.size(); ++f) {
-    const Vec3 a = set.corner(f, 0);
-    const Vec3 n = normalize(cross(set.corner(f, 1) - a, set.corner(f, 2) - a));
-    plane_of_[f] = 2 * uint32_t(plane_normal_.size());
-    for (size_t k = 0; k < plane_normal_.size(); ++k) {
-      if (dot(plane_normal_[k], n) > 1 - 1e-6f) plane_of_[f] = 2 * uint32_t(k);
-    }
-    if (plane_of_[f] == 2 * plane_normal_.size()) plane_normal_.push_back(n);
+    const Vec3 n = set.normal(f);
+    const auto rounded = [](float x) { return std::lround(x * 2e3f); };
+    const auto key = std::tuple(rounded(n.x), rounded(n.y), rounded(n.z));
+    const auto [entry, fresh] = known.try_emplace(key, uint32_t(plane_normal_.size()));
+    if (fresh) plane_normal_.push_back(n);
+    plane_of_[f] = 2 * entry->second;
   }
   objects_moved();
 }
@@ -308,7 +311,7 @@ size_t Direct::resolve(const PixelRays& rays, Vec3 camera, const float* plate,
         }
         rgb[3 * i] = out.x, rgb[3 * i + 1] = out.y, rgb[3 * i + 2] = out.z;
         layer(i, object, alpha, dq, error,
-              film.depth[at] > 0 ? film.depth[at] * per_pass : middle_depth(i), share);
+              film.depths[at] > 0 ? film.depth[at] / film.depths[at] : middle_depth(i), share);
       }
     }
   });

@@ -101,6 +101,7 @@ struct Direct::GatherRays {
     float u;         // picks the lamp
     Pair v;          // picks a direction
     bool from_object;
+    bool takes;  // light that the object hides and that no lamp stands for
   } asker[Packet::kWidth];
 
   GatherRays(const Direct& direct, ShadowRays& shadows, GatherRays* near)
@@ -115,6 +116,7 @@ struct Direct::GatherRays {
   void flush() {
     if (count == 0) return;
     const World& objects = *direct.scene_.objects_;
+    const bool positional = direct.captured_.positional();
     traced += uint64_t(count);
     intersect(objects.scene(), packet, false);
     Hit hits[Packet::kWidth];
@@ -122,7 +124,9 @@ struct Direct::GatherRays {
     for (int k = 0; k < count; ++k) {
       if (packet.hits(k)) hits[k] = packet.hit(k);
       packet.forget_hit(k);
-      packet.valid[k] = direct.captured_.positional() && direct.set_matters(packet, k) ? -1 : 0;
+      const bool behind = hits[k] && asker[k].takes;  // what it hides is asked for
+      if (behind) packet.rays.ray.tfar[k] = kInfinity;
+      packet.valid[k] = positional && (behind || direct.set_matters(packet, k)) ? -1 : 0;
       left += packet.valid[k] != 0;
     }
     if (left) {
@@ -132,10 +136,12 @@ struct Direct::GatherRays {
     for (int k = 0; k < count; ++k) {
       const bool on_set = packet.valid[k] && packet.hits(k);
       const Vec3 d = packet.direction(k);
-      if (on_set) {
-        if (asker[k].from_object) meet_set(asker[k], direct.captured_.at(packet.hit(k), d), d);
-      } else if (hits[k] && near) {
-        meet_object(asker[k], hits[k], d);
+      const Place place = on_set ? direct.captured_.at(packet.hit(k), d) : Place();
+      if (hits[k] && hits[k].t < place.t) {
+        if (near) meet_object(asker[k], hits[k], d);
+        if (asker[k].takes) take(asker[k], place, packet.origin(k), d);
+      } else if (asker[k].from_object) {
+        meet_set(asker[k], place, d);
       }
     }
     packet.clear();
@@ -158,7 +164,8 @@ struct Direct::GatherRays {
     if (direct.captured_.positional()) {
       const Vec3 look = Frame(s.ns).world(sample_cosine(a.v.x, a.v.y));
       if (dot(look, s.ng) > 0) {
-        near->push(start, look, {a.sum, a.square, a.weight * s.alpha * s.base, 0, {}, true});
+        near->push(start, look,
+                   {a.sum, a.square, a.weight * s.alpha * s.base, 0, {}, true, false});
       }
     }
     const LightLists::List& list =
@@ -173,13 +180,30 @@ struct Direct::GatherRays {
     shadows.push(start, in.d, in.t * (1 - 1e-3f), {a.sum, a.square, light, false, true});
   }
 
-  // What is near in the set, and what the objects' shadow takes from it.
+  // Light that no lamp stands for: of places that are too near, or that the probe did not see.
+  bool is_unlisted(const Place& place, Vec3 d) {
+    const Captured& captured = direct.captured_;
+    if (!captured.positional()) return false;
+    if (place && place.t < Lamp::kNear * captured.distance(place)) return true;
+    ++traced;
+    return !captured.is_listed(place, d);
+  }
+
+  // What an object hides of it from the set.
+  void take(const Asker& a, const Place& place, Vec3 o, Vec3 d) {
+    if (!is_unlisted(place, d)) return;
+    const World& objects = *direct.scene_.objects_;
+    const Vec3 through = objects.transmits() ? objects.transmittance(o, d, place.t) : Vec3();
+    give(a, a.weight * direct.captured_.radiance(place, d) * (through - Vec3(1.0f)));
+  }
+
+  // What it sends itself, and what the objects' shadow takes from it.
   void meet_set(const Asker& a, const Place& place, Vec3 d) {
-    const bool is_near = place.t < Lamp::kNear * direct.captured_.distance(place);
-    const bool shadowed = near && direct.bounces_ && place.support;
-    if (!is_near && !shadowed) return;
+    const bool unlisted = is_unlisted(place, d);
+    const bool shadowed = near && direct.bounces_ && place && place.support;
+    if (!unlisted && !shadowed) return;
     const Vec3 light = a.weight * direct.captured_.radiance(place, d);
-    if (is_near) give(a, light);
+    if (unlisted) give(a, light);
     if (!shadowed) return;
     const uint32_t plane = direct.plane_at(place.face, d);
     const LightLists::List& list = direct.list(direct.set_lists(), plane);

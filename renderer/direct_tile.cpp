@@ -323,10 +323,10 @@ void Direct::Tile::light_set() {
   sent_.fill({}), sent_square_.fill(0), lit_.fill({});
   const World& objects = *direct_->scene_.objects_;
   const bool lights = !objects.delta_lights().empty();
-  if (!direct_->gathers() && !lights) return;
+  if (!looks() && !lights) return;
   ShadowRays shadows(*direct_);
   GatherRays near(*direct_, shadows, nullptr), gather(*direct_, shadows, &near);
-  const uint32_t rays = direct_->gathers() ? uint32_t(subsamples(Shows::inside)) : 0;
+  const uint32_t rays = looks() ? uint32_t(subsamples(Shows::inside)) : 0;
   for (int at = 0; at < kPixels; ++at) {
     if (!asks_[at]) continue;
     const Vec3 x{x_[at], y_[at], z_[at]}, n = direct_->normal_of(plane_[at]);
@@ -351,7 +351,8 @@ void Direct::Tile::look_at_objects(GatherRays& gather, Vec3 x, Vec3 n, int at, u
   const float cos = dot(d, n);
   if (cos <= 0) return;
   const Pair v = spread_at(3 * i + 1, turn(at, 3, 0), turn(at, 2, 3));
-  gather.push(start, d, {sum, square, Vec3(weight * cos / cones.density(d)), lamp, v, false});
+  gather.push(start, d, {sum, square, Vec3(weight * cos / cones.density(d)), lamp, v, false,
+                         set_hides_});
 }
 
 FilmTile* Direct::Tile::film() {
@@ -540,7 +541,7 @@ void Direct::Tile::shade_object(Sample& s, ShadowRays& shadows, GatherRays& gath
   if (dot(w, surface.ng) <= 0) return;
   const float lamp = fraction(shift + 0.618034f * float(s.rank) + 0.5f);
   const Pair v = spread_at(3 * s.i + 1, turn(s.at, 3, 0), turn(s.at, 2, 3));
-  gather.push(start, w, {&s.value, &s.square, Vec3(kPi), lamp, v, true});
+  gather.push(start, w, {&s.value, &s.square, Vec3(kPi), lamp, v, true, false});
 }
 
 // The set beside an object.
@@ -566,7 +567,7 @@ void Direct::Tile::shade_set(Sample& s, ShadowRays& shadows, GatherRays& gather)
                  {&s.value, &s.square, light, true, set_hides_});
   }
   if (!d.scene_.objects_->delta_lights().empty()) s.other += delta_change(x, g.normal, s.at);
-  if (!d.gathers()) return;
+  if (!looks()) return;
   look_at_objects(gather, x, g.normal, s.at, s.i,
                   fraction(shift + 0.618034f * float(s.rank) + 0.25f), 1, &s.other, &s.square);
 }
@@ -574,7 +575,8 @@ void Direct::Tile::shade_set(Sample& s, ShadowRays& shadows, GatherRays& gather)
 void Direct::Tile::add_samples(FilmTile& film) {
   on_set_.fill({}), on_object_.fill({});
   for (const Sample& s : samples_of_) {
-    if (s.t < kInfinity) film.depth[film_index(s.at)] += s.t / float(subsamples(shows_[s.at]));
+    if (!(s.t < kInfinity)) continue;
+    film.depth[film_index(s.at)] += s.t, film.depths[film_index(s.at)] += 1;
   }
   for (const uint32_t k : shaded_) {
     const Sample& s = samples_of_[k];

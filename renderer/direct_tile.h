@@ -104,6 +104,8 @@ class Direct::Tile {
   void trace_samples();
   void choose_samples();
   void shade_samples();
+  // Whether pixels of the set send rays to the objects: for their light, or for what they hide.
+  bool looks() const { return direct_->gathers() || set_hides_; }
   void look_through(Sample& s);
   void shade_object(Sample& s, ShadowRays& shadows, GatherRays& gather);
   void shade_set(Sample& s, ShadowRays& shadows, GatherRays& gather);

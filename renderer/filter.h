@@ -22,7 +22,7 @@ struct FilmTile {
   Layer objects;         // diffuse radiance, times pi
   Plane albedo[3];       // diffuse
   Plane other[3];        // radiance of objects that is left alone
-  Plane depth;
+  Plane depth, depths;         // of samples, and how many these are
   bool has_change = false, has_objects = false;  // whether the layers hold anything but 0
 };
 

@@ -62,6 +62,7 @@ Irradiance::Irradiance(const Captured& captured, uint64_t seed)
       const size_t count = size_t(lattice.width) * lattice.height;
       lattice.nodes = std::make_unique<Node[]>(count);
       lattice.cells = std::make_unique<std::atomic<uint8_t>[]>(count);
+      lattice.finer = std::make_unique<tbb::concurrent_unordered_map<uint64_t, Vec3>>();
       lattices_.push_back(std::move(lattice));
     }
   }
@@ -103,6 +104,17 @@ Vec3 Irradiance::node(const Lattice& lattice, int i, int j) const {
   return value;
 }
 
+Vec3 Irradiance::finer_node(const Lattice& lattice, int i, int j, int level) const {
+  if (level == 0) return node(lattice, i, j);
+  const uint64_t key = uint64_t(level) << 60 | uint64_t(j) << 30 | uint64_t(i);
+  if (const auto known = lattice.finer->find(key); known != lattice.finer->end()) {
+    return known->second;
+  }
+  const Vec3 value = solve(lattice.node_place(i, j, level), lattice.n);
+  lattice.finer->emplace(key, value);
+  return value;
+}
+
 // Whether the four nodes of a cell see each other.
 bool Irradiance::is_open(const Lattice& lattice, int i, int j) const {
   std::atomic<uint8_t>& cell = lattice.cells[size_t(j) * lattice.width + i];
@@ -124,25 +136,31 @@ bool Irradiance::is_open(const Lattice& lattice, int i, int j) const {
 Vec3 Irradiance::at(const Place& place) const {
   const uint32_t g = group_[place.face];
   const Lattice& lattice = lattices_[2 * g + (dot(place.n, normals_[g]) < 0)];
-  const Vec3 from = place.p - lattice.corner;
+  const Vec3 from = place.p - lattice.corner, x = place.start();
   const float u = dot(from, lattice.s) / lattice.step, v = dot(from, lattice.t) / lattice.step;
-  const int i = std::clamp(int(u), 0, lattice.width - 2);
-  const int j = std::clamp(int(v), 0, lattice.height - 2);
-  const float a = std::clamp(u - i, 0.0f, 1.0f), b = std::clamp(v - j, 0.0f, 1.0f);
   // in a cell that is cut, a node behind the wall or inside a box has no say
-  const bool open = is_open(lattice, i, j);
-  const Vec3 x = place.start();
-  Vec3 sum;
-  float weights = 0;
-  for (int k = 0; k < 4; ++k) {
-    const int di = k & 1, dj = k >> 1;
-    const float weight = (di ? a : 1 - a) * (dj ? b : 1 - b);
-    if (weight <= 0) continue;
-    if (!open && captured_.blocked(x, lattice.node_place(i + di, j + dj) - x, 1)) continue;
-    sum += weight * node(lattice, i + di, j + dj);
-    weights += weight;
+  const bool open = is_open(lattice, std::clamp(int(u), 0, lattice.width - 2),
+                            std::clamp(int(v), 0, lattice.height - 2));
+  for (int level = 0;; ++level) {
+    const float fine = std::ldexp(1.0f, level);
+    const int i = std::clamp(int(u * fine), 0, ((lattice.width - 1) << level) - 1);
+    const int j = std::clamp(int(v * fine), 0, ((lattice.height - 1) << level) - 1);
+    const float a = std::clamp(u * fine - i, 0.0f, 1.0f);
+    const float b = std::clamp(v * fine - j, 0.0f, 1.0f);
+    Vec3 sum;
+    float weights = 0, least = kInfinity, most = 0;
+    for (int k = 0; k < 4; ++k) {
+      const int di = i + (k & 1), dj = j + (k >> 1);
+      const float weight = (k & 1 ? a : 1 - a) * (k >> 1 ? b : 1 - b);
+      if (!open && captured_.blocked(x, lattice.node_place(di, dj, level) - x, 1)) continue;
+      const Vec3 value = finer_node(lattice, di, dj, level);
+      sum += weight * value;
+      weights += weight;
+      least = std::min(least, mean(value)), most = std::max(most, mean(value));
+    }
+    if (most > kSmooth * least && level < kLevels) continue;
+    return weights > 0 ? sum * (1 / weights) : solve(x, place.n);
   }
-  return weights > 0 ? sum * (1 / weights) : solve(x, place.n);
 }
 
 }  // namespace chromeball

@@ -1,6 +1,8 @@
 // E_without: the irradiance that the support surfaces receive in the set as it was captured.
 #pragma once
 
+#include <tbb/concurrent_unordered_map.h>
+
 #include <atomic>
 #include <memory>
 
@@ -8,8 +10,9 @@
 
 namespace chromeball {
 
-// Solved on a lattice over each support plane where it is asked for, bilinear in between. All
-// points use the same well-spread samples, so that what error is left is smooth.
+// Solved on a lattice over each support plane where it is asked for, bilinear in between; a cell
+// whose nodes differ much is halved, again and again. All points use the same well-spread
+// samples, so that what error is left is smooth.
 class Irradiance {
  public:
   Irradiance(const Captured& captured, uint64_t seed);
@@ -22,6 +25,8 @@ class Irradiance {
  private:
   static constexpr uint32_t kSamples = 256;  // of each of the two strategies
   static constexpr int kCells = 80;          // along the diagonal of a plane
+  static constexpr int kLevels = 7;          // of halving
+  static constexpr float kSmooth = 1.2f;     // what the nodes of a cell may differ by
 
   struct Node {
     std::atomic<uint8_t> ready{0};
@@ -34,12 +39,17 @@ class Irradiance {
     std::unique_ptr<Node[]> nodes;
     std::unique_ptr<std::atomic<uint8_t>[]> cells;  // 0 unknown, 1 open, 2 cut by a wall
 
-    Vec3 node_place(int i, int j) const {
-      return corner + step * (float(i) * s + float(j) * t) + rise * n;
+    // of the cells that are halved, by level and place
+    std::unique_ptr<tbb::concurrent_unordered_map<uint64_t, Vec3>> finer;
+
+    Vec3 node_place(int i, int j, int level = 0) const {
+      const float size = std::ldexp(step, -level);
+      return corner + size * (float(i) * s + float(j) * t) + rise * n;
     }
   };
   bool is_open(const Lattice& lattice, int i, int j) const;
   Vec3 node(const Lattice& lattice, int i, int j) const;
+  Vec3 finer_node(const Lattice& lattice, int i, int j, int level) const;
 
   const Captured& captured_;
   SampleTable table_;

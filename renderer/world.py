@@ -88,7 +88,7 @@ def world(
     for thing in objects:
         instance = thing if isinstance(thing, Instance) else Instance(thing)
         steps = np.array([moved_back(matrix, about) for matrix in instance.matrices()])
-        _check_reach(instance.mesh.vertices, steps)
+        check_reach(extent(instance.mesh.vertices), steps)
         built.place(mesh(instance.mesh), steps)
     for light in lights:
         p = light.position
@@ -103,12 +103,15 @@ def world(
     return built
 
 
-def _check_reach(vertices: NDArray[np.float32], steps: NDArray[np.float64]) -> None:
-    if not len(vertices):
-        return
-    extent = np.maximum(-vertices.min(axis=0), vertices.max(axis=0)).astype(float)
-    reach = float((np.abs(steps[..., :3]) @ np.abs(extent) + np.abs(steps[..., 3])).max())
-    if reach > _FARTHEST:
+def extent(vertices: NDArray[np.float32]) -> NDArray[np.float64]:
+    """The largest magnitude of each coordinate (3,) of vertices (V, 3); 0 of none."""
+    return np.abs(vertices).max(axis=0, initial=0).astype(float)
+
+
+def check_reach(extent: NDArray[np.float64], steps: NDArray[np.float64]) -> None:
+    """Raise UserError where transforms (..., 3, 4) put a mesh of that extent too far away."""
+    reach = float((np.abs(steps[..., :3]) @ extent + np.abs(steps[..., 3])).max())
+    if not reach <= _FARTHEST:
         raise UserError(
             f"an object reaches {reach:.3g} m from the light probe, {_FARTHEST:.0e} m is the "
             "most: is its scale right?"
