@@ -4,6 +4,7 @@ namespace chromeball {
 namespace {
 
 constexpr float kMuch = 0.15f;  // of E that may be hidden: the full number of rays is spent
+constexpr float kEven = 0.01f;  // of 1 / E, within 4 x 4 pixels
 constexpr float kJump = 0.02f;  // of the distance, between neighbours: an edge
 constexpr int kRays = 2;        // shadow rays for each sample of a pixel
 
@@ -152,19 +153,28 @@ Vec3 Direct::Tile::irradiance(uint32_t face, Vec3 x, uint32_t plane) const {
   return direct_->scene_.irradiance_.at(place);
 }
 
-// E is smooth: one value for 4 x 4 pixels of a plane.
+// Where E is smooth one value will do for 4 x 4 pixels of a plane: where the first and the last
+// of them agree.
 void Direct::Tile::find_irradiance() {
+  const auto inverse_at = [&](int at) {
+    const Vec3 x{x_[at], y_[at], z_[at]};
+    return over(Vec3(1.0f), irradiance(direct_->face_[index(pixel(at))], x, plane_[at]));
+  };
   for (int block = 0; block < kWidth; ++block) {
-    uint32_t plane = kNowhere;
-    Vec3 inverse;
-    for (int cell = 0; cell < kPixels / kWidth; ++cell) {
-      const int at = cell * kWidth + block;
+    int first = -1, last = -1;
+    bool one_plane = true;
+    for (int at = block; at < kPixels; at += kWidth) {
       if (!asks_[at]) continue;
-      if (plane != plane_[at]) {
-        plane = plane_[at];
-        inverse = over(Vec3(1.0f), irradiance(direct_->face_[index(pixel(at))],
-                                              {x_[at], y_[at], z_[at]}, plane));
-      }
+      if (first < 0) first = at;
+      last = at;
+      one_plane &= plane_[at] == plane_[first];
+    }
+    if (first < 0) continue;
+    const Vec3 from = inverse_at(first), to = inverse_at(last);
+    const bool even = one_plane && mean(abs(to - from)) < kEven * mean(from);
+    for (int at = block; at < kPixels; at += kWidth) {
+      if (!asks_[at]) continue;
+      const Vec3 inverse = even ? 0.5f * (from + to) : inverse_at(at);
       inverse_[0][at] = inverse.x, inverse_[1][at] = inverse.y, inverse_[2][at] = inverse.z;
     }
   }
