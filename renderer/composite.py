@@ -129,9 +129,18 @@ type Reflect = Literal["plate", "map"]
 type Integrator = Literal["path", "direct", "ao"]
 
 
-def even_light(stand_in: StandInMesh | None, place: NDArray[np.float64]) -> CapturedSet:
-    """A stand-in under an even white sky, as if its map had been taken at `place` (3,)."""
-    return CapturedSet(np.ones((16, 32, 3), np.float32), place, stand_in)
+def even_light(
+    stand_in: StandInMesh | None, place: NDArray[np.float64], plate: NDArray[np.float32]
+) -> CapturedSet:
+    """A stand-in under an even white sky, as if its map had been taken at `place` (3,).
+
+    The sky is as bright as white is in a plate (H, W, 3) whose log-average is grey of 18 %
+    (Reinhard, Stark, Shirley, Ferwerda 2002).
+    """
+    brightness = plate.mean(axis=2, dtype=float)
+    seen = brightness[brightness > 0]
+    white = float(np.exp(np.log(seen).mean())) / 0.18 if seen.size else 1.0
+    return CapturedSet(np.full((16, 32, 3), white, np.float32), place, stand_in)
 
 
 class Compositor:
@@ -215,7 +224,7 @@ class Compositor:
         if integrator == "ao":
             if plate is None:
                 raise UserError("ambient occlusion has no light to show: it needs a plate")
-            captured = even_light(captured.stand_in, np.asarray(camera, float))
+            captured = even_light(captured.stand_in, np.asarray(camera, float), plate)
         self._difference = mode == "difference"
         self._environment = np.ascontiguousarray(captured.environment, np.float32)
         self._plate_samples = plate_samples

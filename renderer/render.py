@@ -107,7 +107,8 @@ def prepare(scene: Scene, folder: Path, view: View, spp: int) -> Job:
             )
         back = backdrop(scene, folder, view, np.zeros(3))
         stand_in, inputs = _stand_in(scene, folder)
-        captured = even_light(stand_in, back.camera.world_from_camera.translation)
+        assert back.plate is not None
+        captured = even_light(stand_in, back.camera.world_from_camera.translation, back.plate)
     else:
         captured, inputs = captured_set(scene, folder)
         back = backdrop(scene, folder, view, captured.origin)

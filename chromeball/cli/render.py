@@ -261,13 +261,10 @@ def _line(outcome: Outcome) -> str:
             return f"{outcome.output}: {figures['spp']} spp in {figures['seconds']:.1f} s"
         case "rendered":
             spread, speed = figures["relative_error"], figures["mrays_per_second"]
-            noise = f"{spread:.2%}" if isinstance(spread, float) else "unknown"
+            noise = f", noise {spread:.2%} of their mean" if isinstance(spread, float) else ""
             rays = f", {speed:.1f} Mrays/s" if isinstance(speed, float) else ""
             made = f"{outcome.output}: {figures['spp']} spp in {figures['seconds']:.1f} s{rays}"
             changed = figures["changed_pixels"]
             if not changed:
                 return f"{made}, no pixel changed: no object is seen, none touches the light"
-            return (
-                f"{made}, {changed} pixels changed, noise {noise} of their mean; "
-                f"{figures['png']} beside it"
-            )
+            return f"{made}, {changed} pixels changed{noise}; {figures['png']} beside it"

@@ -167,6 +167,84 @@ def test_all_shadow_of_a_ball_near_the_floor() -> None:
     assert abs(np.mean(ratios) - 1) < 4e-3 + 3 * error  # the middles of 32 passes
 
 
+def panel_beside(half: float) -> tuple[StandInMesh, NDArray[np.float32], NDArray[np.float64]]:
+    """A lit panel of 2 x 1 m on a floor, seen by a probe 1.5 m before it: nearly all light."""
+    corners = np.array([[-1, 0, 1], [1, 0, 1], [1, 0, -1], [-1, 0, -1]]) * half
+    panel = np.array([[-1, 0, 1], [-1, 0, -1], [-1, 1, -1], [-1, 1, 1]])
+    v = np.concatenate([corners, panel]).astype(np.float32)
+    f = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]], np.uint32)
+    surface = np.array([SUPPORT, SUPPORT, ENVIRONMENT, ENVIRONMENT], np.uint8)
+    h, probe = 128, np.array([0.5, 1.0, 0.0])
+    theta = (np.arange(h)[:, None] + 0.5) * np.pi / h
+    phi = (np.arange(2 * h)[None] + 0.5) * np.pi / h - np.pi
+    x, y, z = -np.sin(phi) * np.sin(theta), np.cos(theta), np.cos(phi) * np.sin(theta)
+    t = 1.5 / np.maximum(-x, 1e-6)
+    lit = (x < 0) & (abs(1 + t * y - 0.5) < 0.5) & (abs(t * z) < 1)
+    sky = np.where(lit[..., None], 10, 0.02) * np.ones(3)
+    return StandInMesh(v, v, f, surface), sky.astype(np.float32), probe
+
+
+@pytest.mark.parametrize("integrator", ["path", "direct"])
+@pytest.mark.parametrize("half", [3.0, 30.0])
+def test_a_screen_before_a_panel_takes_all_light(integrator: str, half: float) -> None:
+    """Light that is near, which no lamp stands for; irradiance that varies from cm to cm."""
+    stand_in, sky, probe = panel_beside(half)
+    vertices, faces, _ = box()
+    screen = Mesh.of(vertices, faces, 0.0).placed(
+        Pose(np.eye(3), np.array([-0.93, 0, 0])), np.array([0.04, 1.1, 2.4])
+    )
+    eye = np.array([0.4, 1.6, 1.6])
+    view = CameraModel.pinhole(SIZE, 0.8, Pose.look_at(eye, np.array([-0.5, 0, 0])))
+    plate = np.ones((SIZE[1], SIZE[0], 3), np.float32)
+    job = Compositor(
+        [screen],
+        CapturedSet(sky, probe, stand_in),
+        corner_rays(view),
+        eye,
+        plate,
+        bounces=0,
+        samples=128,
+        integrator=integrator,  # type: ignore[arg-type]
+        filtered=False,
+    )
+    job.add(128)
+    seen = job.result()
+    corners = corner_rays(view)
+    d = corners[:-1, :-1] + corners[1:, 1:]
+    x = eye - eye[1] / d[..., 1:2] * d
+    q = seen.quotient.mean(axis=2)
+    shadow = (seen.alpha == 0) & (abs(x[..., 2]) < 0.5) & (x[..., 0] < 0)
+    for low, high in ((-0.85, -0.7), (-0.7, -0.4), (-0.4, 0)):
+        part = shadow & (x[..., 0] > low) & (x[..., 0] < high)
+        assert part.sum() > 15
+        # what is left comes from the dim rest of the world
+        assert -0.02 < q[part].mean() < 0.03
+
+
+def test_light_that_the_set_hides_from_the_probe_alone_reaches_an_object() -> None:
+    """Above the probe an object sees past the floor's edge what no lamp stands for."""
+    even = np.ones((64, 128, 3), np.float32)
+    for half in (1.0, 5.0):
+        eye, there = np.array([0, 1.4, 1.9]), np.array([0, 1.2, 0])
+        view = CameraModel.pinhole(SIZE, 0.5, Pose.look_at(eye, there))
+        job = compositor([ball((0, 1.2, 0), 0.3)], floor(half), even, view=view)
+        job.add(256)
+        seen = job.result()
+        assert seen.objects[seen.alpha == 1].mean() == pytest.approx(0.6, rel=5e-3)
+
+
+def test_depth_of_edges_is_that_of_what_they_show() -> None:
+    jobs = [
+        compositor([ball((0, 0.3, 0), 0.3)], floor(), window_light(), integrator=integrator)
+        for integrator in ("path", "direct")
+    ]
+    for job in jobs:
+        job.add(64)
+    path, direct = (job.result() for job in jobs)
+    solid = path.alpha > 0.05
+    assert np.abs(direct.depth / path.depth - 1)[solid].max() < 0.08
+
+
 def test_shadow_of_a_ball_under_an_even_sky_is_its_form_factor() -> None:
     # irradiance blocked by a sphere above the horizon: (r / d)^2 cos (Howell, B-44)
     r, h = 0.3, 0.8
