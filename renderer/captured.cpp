@@ -39,6 +39,8 @@ void Captured::find_planes() {
       flat_ &= std::abs(dot(to, across)) <= 1e-4f * length(to);
     }
   }
+  const Vec3 n = stand_in.normal(0);
+  below_ = dot(corner - origin_, n) < 0 ? -n : n;
   const size_t v = stand_in.vertices.size() / 3;
   accel_.add(stand_in.vertices.data(), v, stand_in.faces.data(), stand_in.size());
   Accel original;  // the set as it was when the map was captured

@@ -96,6 +96,7 @@ class Captured {
   // the map shows. It does not where another part of the set stands before the place, or where
   // the set stands in that direction and the ray passes it by.
   bool is_listed(const Place& place, Vec3 d) const {
+    if (!place && flat_ && dot(d, below_) <= 0) return true;
     if (!place) return !positional() || !accel_.occluded(origin_, d, kInfinity);
     return flat_ || !accel_.occluded(origin_, place.captured_at - origin_, 1 - 1e-3f);
   }
@@ -178,6 +179,7 @@ class Captured {
   std::vector<Light> lights_;
   std::optional<Peaks> peaks_;
   bool flat_ = true;
+  Vec3 below_;  // from the origin to a flat set
 };
 
 }  // namespace chromeball
