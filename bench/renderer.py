@@ -94,16 +94,25 @@ def _bias_rows(quick: bool) -> list[Row]:
         setting = hotel(variant)
         truth = setting.job(1, 16)
         truth.add(8 if quick else 32)
+        a = truth.result()
+        ratios: list[float] = []
         start = time.process_time()
-        job = setting.job(0, 16, integrator="direct")
-        job.add(16)
-        seconds = time.process_time() - start
-        a, b = truth.result(), job.result()
-        floor = (a.alpha == 0) & (b.alpha == 0) & b.changed
-        bias = float(b.quotient[floor].mean() / a.quotient[floor].mean()) - 1
+        for seed in range(4 if quick else 16):
+            job = setting.job(seed, 16, integrator="direct")
+            job.add(16)
+            b = job.result()
+            floor = (a.alpha == 0) & (b.alpha == 0) & b.changed
+            ratios.append(float(b.quotient[floor].mean() / a.quotient[floor].mean()))
+        seconds = (time.process_time() - start) / len(ratios)
+        bias = float(np.mean(ratios)) - 1
+        scatter = float(np.std(ratios, ddof=1))
+        floor = (a.alpha == 0) & a.changed
         noise = float(np.sqrt(np.mean(a.standard_error[floor] ** 2) / floor.sum()))
         noise /= float(a.rgb[floor].mean())
-        note = f"of {b.quotient[floor].mean():.3f}; the path's own noise {noise:.1e}"
+        note = (
+            f"mean of {len(ratios)} seeds of 16 samples that scatter by {scatter:.1e}; "
+            f"the path's own noise {noise:.1e}"
+        )
         what, unit = f"mean floor ratio, {WORDS[variant]}", "of the path integrator's"
         found.append(Row("renderer", what, "chromeball direct", seconds, abs(bias), unit, note))
     return found
