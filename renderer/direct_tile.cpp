@@ -35,7 +35,9 @@ uint64_t Direct::Tile::shade(Direct& direct, const PixelRays& rays, Vec3 camera,
   direct_ = &direct, rays_ = &rays, camera_ = camera, samples_ = samples, x0_ = x0, y0_ = y0;
   traced_ = 0;
   start_ = spread(uint32_t(direct.seed_ ^ direct.seed_ >> 32) * 2654435761u);
-  pass_turn_ = fraction(float(direct.passes_) * 0.618034f + start_.x);
+  // another for each tile, too: of 16 pixels a whole number asks, of many tiles the right part
+  const int number = y0 / kTile * direct.tiles_across() + x0 / kTile;
+  pass_turn_ = fraction(float(direct.passes_) * 0.618034f + start_.x + float(number) * 0.754878f);
   positional_ = direct.captured_.positional();
   const bool flat = positional_ && direct.captured_.flat();
   set_hides_ = positional_ && !flat;
