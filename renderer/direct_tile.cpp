@@ -35,9 +35,7 @@ uint64_t Direct::Tile::shade(Direct& direct, const PixelRays& rays, Vec3 camera,
   direct_ = &direct, rays_ = &rays, camera_ = camera, samples_ = samples, x0_ = x0, y0_ = y0;
   traced_ = 0;
   start_ = spread(uint32_t(direct.seed_ ^ direct.seed_ >> 32) * 2654435761u);
-  // another for each tile, too: of 16 pixels a whole number asks, of many tiles the right part
-  const int number = y0 / kTile * direct.tiles_across() + x0 / kTile;
-  pass_turn_ = fraction(float(direct.passes_) * 0.618034f + start_.x + float(number) * 0.754878f);
+  pass_turn_ = fraction(float(direct.passes_) * 0.618034f + start_.x);
   positional_ = direct.captured_.positional();
   const bool flat = positional_ && direct.captured_.flat();
   set_hides_ = positional_ && !flat;
@@ -205,7 +203,9 @@ void Direct::Tile::shadow_row(const Group& g, int row) {
   bool any = false;
   for (int k = 0; k < kWidth; ++k) any |= asks_[row + k] && plane_[row + k] == g.plane;
   const Asked asked = this->asked(g);
-  const float shift = fraction(turn(row) + pass_turn_);
+  // of a tile's 16 rows a whole number asks, of many tiles the right part
+  const int number = y0_ / kTile * direct_->tiles_across() + x0_ / kTile;
+  const float shift = fraction(turn(row) + pass_turn_ + float(number) * 0.754878f);
   if (!any || shift >= asked.part) return;
   const size_t m = g.choices.size();
   for (int j = 0; j < asked.rays; ++j) {
