@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import optimize, signal, stats
+from scipy import special
 
 from chromeball.scene.errors import UserError
 
@@ -142,6 +142,8 @@ def grain(
     White noise through the square root of the spectrum. Where the measured correlation, an
     estimate, is not one that noise can have, its spectrum is cut at zero.
     """
+    from scipy import signal  # takes as long to load as a small picture to render
+
     height, width = shape
     channels = correlation.shape[-1]
     kernel = _kernel(correlation)
@@ -254,13 +256,14 @@ def _curves(
     flat = np.ones(len(mean), bool)
     for c in range(channels):
         m = freedom[c]
-        limit = stats.chi2.ppf(_FLAT, m) / m
+        # the quantile of chi^2_m over m
+        limit = 2 * special.gammaincinv(m / 2, _FLAT) / m
         # E of chi^2_m / m below its quantile
-        share = stats.chi2.cdf(limit * m, m + 2) / _FLAT
+        share = special.gammainc((m + 2) / 2, limit * m / 2) / _FLAT
         order = np.argsort(mean[:, c], kind="stable")
         for k, part in enumerate(np.array_split(order, levels)):
             s2 = spread[part, c] / trace[c]
-            v = np.quantile(s2, 0.25) * m / stats.chi2.ppf(0.25, m)
+            v = np.quantile(s2, 0.25) * m / (2 * special.gammaincinv(m / 2, 0.25))
             keep = np.ones(len(s2), bool)
             for _ in range(50):
                 keep = s2 <= v * limit
@@ -293,6 +296,8 @@ def _correlation(x: Float, mean: Float, curves: _Curves, flat: NDArray[np.bool_]
 
 
 def _noise(curves: _Curves, correlation: Float, patches: int) -> Noise:
+    from scipy import optimize  # takes long to load
+
     radiance, variance = curves
     linear = np.empty((2, radiance.shape[1]))
     for c in range(radiance.shape[1]):

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage, optimize, special
+from scipy import ndimage, special
 
 from chromeball.scene.color import LUMINANCE
 from chromeball.scene.errors import UserError
@@ -106,6 +106,8 @@ def softening(width: float, edge: Callable[[Float], Float] = pixel_area) -> Floa
     whose sum of shifted edges is nearest to Phi(x / width); a sampled Gaussian is not, below a
     pixel. A picture that is softer already gets [1].
     """
+    from scipy import optimize  # takes long to load
+
     reach = int(np.ceil(4 * width)) + 1
     x = np.linspace(-reach - 2, reach + 2, 32 * (2 * reach + 4) + 1)
     sides = [edge(x - n) + edge(x + n) if n else edge(x) for n in range(reach + 1)]
