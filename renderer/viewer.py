@@ -185,7 +185,7 @@ class Tab:
         """Put the browser's camera where the view's is."""
         handle, pose = self.client.camera, camera.world_from_camera
         self._own = pose
-        self._patience = time.monotonic() + _PATIENCE
+        self._patience = math.inf  # counts from the browser's first word, which may be late
         with self.client.atomic():
             handle.up_direction = -pose.rotation[:, 1]
             handle.position = pose.translation
@@ -203,6 +203,7 @@ class Tab:
             if not moved and np.linalg.norm(turned[:, 2] - self._own.rotation[:, 2]) <= _SAME:
                 self._patience = 0.0  # it has arrived
                 return
+            self._patience = min(self._patience, time.monotonic() + _PATIENCE)
             if time.monotonic() < self._patience:
                 return  # where it was before it was sent there
         self._own = None
