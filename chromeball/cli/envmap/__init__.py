@@ -1,0 +1,12 @@
+"""``chromeball envmap``: the light around a point."""
+
+from cyclopts import App
+
+from chromeball.cli.envmap.align import align
+from chromeball.cli.envmap.lights import lights
+from chromeball.cli.envmap.probe import probe
+from chromeball.cli.envmap.warp import warp
+
+app = App(name="envmap", help="The light around a point.")
+for _command in (warp, align, probe, lights):
+    app.command(_command)

@@ -1,0 +1,157 @@
+"""What people type, and what all commands of the group print and write."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from cyclopts import Parameter
+
+from chromeball.scene.errors import UserError
+
+if TYPE_CHECKING:
+    from chromeball.envmap.mapping import Mapping
+    from chromeball.scene.camera import CameraModel
+    from chromeball.scene.manifest import Probe
+
+type Kind = Literal["mirror", "angular", "fisheye", "paraboloid", "cube", "latlong"]
+type Out = Annotated[Path, Parameter(name=["--output", "-o"])]
+type Json = Annotated[bool, Parameter(negative="")]
+
+
+def parse_numbers(text: str | None, option: str, count: int | None) -> list[float]:
+    """Numbers with commas between; `count` of them unless None."""
+    try:
+        values = [float(part) for part in (text or "").split(",")]
+    except ValueError as error:
+        raise UserError(f"{option} {text!r}: numbers with commas between") from error
+    if not all(math.isfinite(value) for value in values):
+        raise UserError(f"{option} {text!r}: the numbers must be finite")
+    if count is not None and len(values) != count:
+        raise UserError(f"{option} {text!r}: {count} numbers are needed, not {len(values)}")
+    return values
+
+
+def parse_points(text: str) -> list[list[float]]:
+    """The four corners, each ``x,y``."""
+    points = [parse_numbers(pair, "--points", 2) for pair in text.split()]
+    if len(points) != 4:
+        raise UserError(f"--points: four corners are needed, not {len(points)}")
+    return points
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """`WxH`."""
+    try:
+        width, height = (int(part) for part in text.lower().split("x"))
+    except ValueError as error:
+        raise UserError(f"--size {text!r}: write it as 640x480") from error
+    if min(width, height) < 1:
+        raise UserError(f"--size {text!r}: it must be positive")
+    return width, height
+
+
+def check_panorama_width(width: int) -> None:
+    """Refuse what no lat-long map can have."""
+    if not 2 <= width <= 65536 or width % 2:
+        raise UserError(f"--width {width}: a lat-long map's width is even, from 2 to 65536")
+
+
+def need_size(picture: Path) -> tuple[int, int]:
+    """Width and height of a picture that must exist."""
+    from chromeball.scene.image import read_size
+
+    return read_size(picture)
+
+
+def picture_size(picture: Path | None) -> tuple[int, int] | None:
+    """Width and height, or None without a picture."""
+    return None if picture is None else need_size(picture)
+
+
+def read_camera(path: Path, size: tuple[int, int] | None, picture: Path | None) -> CameraModel:
+    """A camera model that fits pictures of `size`."""
+    from chromeball.scene.camera import CameraModel
+
+    model = CameraModel.read(path)
+    if size is not None and model.size != size:
+        raise UserError(
+            f"the camera's pictures are {model.size[0]}x{model.size[1]}, "
+            f"{picture or '--size'} is {size[0]}x{size[1]}",
+            file=path,
+        )
+    return model
+
+
+def source_fisheye(
+    lens: str | None, camera: Path | None, size: tuple[int, int], picture: Path
+) -> Mapping:
+    """The fisheye that --lens or --camera says, for pictures of `size`."""
+    from chromeball.envmap.mapping import of_camera, parse_lens
+
+    if (lens is None) == (camera is None):
+        raise UserError("a fisheye needs --lens or --camera, one of the two")
+    if camera is not None:
+        return of_camera(read_camera(camera, size, picture))
+    return of_camera(parse_lens(lens or "", size))
+
+
+def lens_of(
+    probe: Probe, size: tuple[int, int], root: Path, picture: Path | None
+) -> CameraModel:
+    """The probe's camera as the scene file says."""
+    from chromeball.scene.camera import CameraModel
+
+    if (probe.lens is None) == (probe.camera is None):
+        raise UserError("[probe] needs a lens or a camera, one of the two")
+    if probe.camera is not None:
+        return read_camera(root / probe.camera, size, picture)
+    assert probe.lens is not None
+    return CameraModel.fisheye(
+        probe.lens.model,
+        size,
+        math.radians(probe.lens.fov),
+        centre=probe.lens.centre,
+        radius=probe.lens.radius,
+    )
+
+
+def write_panorama(
+    stage: Any, output: Path, radiance: Any, alpha: Any, kept: dict[str, Any], origin: Any
+) -> None:
+    """A lat-long map with alpha, its attributes and its preview."""
+    import numpy as np
+
+    from chromeball.envmap.picture import latlong_attributes, tone_mapped, write_preview
+    from chromeball.scene.image import write_exr
+
+    kept.pop("origin", None)
+    stage.figures["preview"] = write_preview(output, "preview", tone_mapped(radiance, alpha))
+    with stage.output(output) as temporary:
+        write_exr(
+            temporary,
+            np.concatenate([radiance, alpha[..., None]], axis=2),
+            channels=("R", "G", "B", "A"),
+            attributes=latlong_attributes(kept, origin),
+        )
+
+
+def print_figures(figures: dict[str, object], as_json: bool, output: Path) -> None:
+    """The output's name and its figures, or all as JSON."""
+    from chromeball.scene.record import to_json
+
+    if as_json:
+        print(json.dumps({"output": str(output), **to_json_dict(figures)}, indent=1))
+        return
+    print(output)
+    for name, value in figures.items():
+        print(f"  {name}: {to_json(value)}")
+
+
+def to_json_dict(figures: dict[str, object]) -> dict[str, object]:
+    """Figures as plain JSON values."""
+    from chromeball.scene.record import to_json
+
+    return {name: to_json(value) for name, value in figures.items()}

@@ -1,0 +1,124 @@
+"""``chromeball envmap lights``: a map as light samples."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+from cyclopts import Parameter
+
+from chromeball.cli.envmap.arguments import Json, Out, print_figures
+from chromeball.scene.errors import UserError
+
+
+def lights(
+    env: Path,
+    /,
+    *,
+    count: int = 64,
+    depth: Path | None = None,
+    ambient: Annotated[bool, Parameter(negative="")] = False,
+    output: Out,
+    json: Json = False,
+) -> None:
+    """A map as light samples of the same total irradiance (variance cut).
+
+    Parameters
+    ----------
+    env
+        A lat-long map.
+    count
+        How many lights at most.
+    depth
+        A light-depth map, env_depth.exr: the lights get positions.
+    ambient
+        Keep the order-2 harmonics of what the lights leave out.
+    output
+        The lights, lights.json.
+    json
+        Print the figures as JSON.
+
+    """
+    import numpy as np
+
+    from chromeball.envmap.lights import variance_cut
+    from chromeball.envmap.mapping import LatLong, make_mapping
+    from chromeball.envmap.picture import read_radiance, tone_mapped, write_preview
+    from chromeball.scene.record import Stage, write_json
+
+    if not 1 <= count <= 65536:
+        raise UserError(f"--count {count}: between 1 and 65536 lights")
+    image = read_radiance(env)
+    radiance, size, kept = image.rgb, image.size, image.attributes
+    try:
+        make_mapping("latlong", size)
+    except UserError as error:
+        raise UserError(error.what, file=env) from error
+    distance = _read_depth(depth, size) if depth is not None else None
+    origin = kept.get("origin")
+    if distance is not None and origin is None:
+        raise UserError(
+            "no attribute `origin`: positions need the probe's place; make the map with "
+            "`envmap probe --align`",
+            file=env,
+        )
+    with Stage("envmap lights", [env, *([depth] if depth else [])], count=count) as stage:
+        try:
+            result = variance_cut(
+                radiance,
+                count,
+                depth=distance,
+                origin=np.zeros(3) if origin is None else np.ravel(origin),
+                ambient=ambient,
+            )
+        except UserError as error:
+            raise UserError(error.what, file=env) from error
+        own = result.own_irradiance()
+        energy = (result.radiance * result.solid_angles[:, None]).sum(axis=0)
+        scale = np.maximum(result.irradiance.max(axis=0), 1e-300)
+        display = tone_mapped(radiance)
+        small = LatLong((display.shape[1], display.shape[0]))
+        stage.figures |= {
+            "lights": len(result.directions),
+            "positioned": int(np.isfinite(result.positions).all(axis=1).sum()),
+            "total": result.total,
+            "total_error": float(np.max(np.abs(energy / np.maximum(result.total, 1e-300) - 1))),
+            "irradiance_error": float(
+                np.sqrt(np.mean(((own - result.irradiance) / scale) ** 2))
+            ),
+            "preview": write_preview(
+                output, "preview", _dots(display, small.pixels_of(result.directions))
+            ),
+        }
+        with stage.output(output) as temporary:
+            write_json(temporary, result.to_json())
+    print_figures(stage.figures, json, output)
+
+
+def _read_depth(path: Path, size: tuple[int, int]) -> Any:
+    """Metres, (H, W) at `size`, the nearest sample of a light-depth map."""
+    import numpy as np
+
+    from chromeball.scene.image import read_image
+
+    image = read_image(path)
+    if "Z" not in image.channels:
+        raise UserError("no channel Z: not a light-depth map", file=path)
+    distance = image.pixels[..., image.channels.index("Z")].astype(np.float32)
+    height, width = distance.shape
+    if width != 2 * height:
+        raise UserError(f"{width}x{height} is no lat-long map: it must be 2:1", file=path)
+    x = (np.arange(size[0]) + 0.5) * width / size[0]
+    y = (np.arange(size[1]) + 0.5) * height / size[1]
+    return np.ascontiguousarray(distance[y.astype(int)[:, None], x.astype(int)[None, :]])
+
+
+def _dots(display: Any, pixels: Any) -> Any:
+    import cv2
+    import numpy as np
+
+    picture = np.ascontiguousarray(display)
+    for x, y in np.round(pixels).astype(int):
+        cv2.circle(picture, (int(x), int(y)), 3, (0, 0, 0), -1, cv2.LINE_AA)
+        cv2.circle(picture, (int(x), int(y)), 2, (255, 220, 0), -1, cv2.LINE_AA)
+    return picture
