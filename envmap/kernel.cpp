@@ -114,10 +114,19 @@ float lookup(const std::vector<float>& table, float u) {
 
 using Table = nb::ndarray<const float, nb::c_contig, nb::device::cpu>;
 
+// Where a face of a cube stands in the picture, in faces.
+struct Placed {
+  Vec forward, right, down;
+  float column, row;
+};
+
 // One mapping between directions and pixels. Radial ones and arbitrary lenses come as tables.
 struct Projection {
-  enum class Kind { latlong, cube, radial, table } kind{};
+  enum class Kind { latlong, cube, octahedral, radial, table } kind{};
   int width = 0, height = 0;
+  // cube: pixels a side of a face
+  int face = 0;
+  std::array<Placed, 6> faces{};
   // radial: pixel = centre + (fx, fy) * r(theta) * (cos phi, sin phi)
   float fx = 1, fy = 1, cx = 0, cy = 0, max_angle = 0, rim = 0;
   std::vector<float> radius;          // r over theta / max_angle
@@ -137,10 +146,23 @@ struct Projection {
         y = (arc_tangent(d.y, std::sqrt(d.x * d.x + d.z * d.z)) / kPi + 0.5f) * float(height) - 0.5f;
         return true;
       case Kind::cube: {
-        const Face& f = kFaces[face_of(d)];
-        const float w = dot(d, f.forward), n = float(width / 4);
-        x = (float(f.column) + (dot(d, f.right) / w + 1) / 2) * n - 0.5f;
-        y = (float(f.row) + (dot(d, f.down) / w + 1) / 2) * n - 0.5f;
+        const Placed* best = faces.data();
+        for (const Placed& f : faces)
+          if (dot(d, f.forward) > dot(d, best->forward)) best = &f;
+        const float w = dot(d, best->forward), n = float(face);
+        x = (best->column + (dot(d, best->right) / w + 1) / 2) * n - 0.5f;
+        y = (best->row + (dot(d, best->down) / w + 1) / 2) * n - 0.5f;
+        return true;
+      }
+      case Kind::octahedral: {
+        const float scale = 1 / (std::abs(d.x) + std::abs(d.y) + std::abs(d.z));
+        float u = scale * d.x, v = scale * d.y;
+        if (d.z < 0) {
+          const float p = std::copysign(1 - std::abs(v), u), q = std::copysign(1 - std::abs(u), v);
+          u = p, v = q;
+        }
+        x = (u + 1) / 2 * float(width) - 0.5f;
+        y = (v + 1) / 2 * float(height) - 0.5f;
         return true;
       }
       case Kind::radial: {
@@ -182,9 +204,9 @@ struct Projection {
         return true;
       }
       case Kind::cube: {
-        const float n = float(width / 4), s = (x + 0.5f) / n, t = (y + 0.5f) / n;
-        for (const Face& f : kFaces) {
-          const float a = 2 * (s - float(f.column)) - 1, b = 2 * (t - float(f.row)) - 1;
+        const float n = float(face), s = (x + 0.5f) / n, t = (y + 0.5f) / n;
+        for (const Placed& f : faces) {
+          const float a = 2 * (s - f.column) - 1, b = 2 * (t - f.row) - 1;
           if (a < -1 || a >= 1 || b < -1 || b >= 1) continue;
           const float norm = 1 / std::sqrt(1 + a * a + b * b);
           d = norm * (f.forward + a * f.right + b * f.down);
@@ -192,6 +214,19 @@ struct Projection {
           return true;
         }
         return false;
+      }
+      case Kind::octahedral: {
+        float u = 2 * (x + 0.5f) / float(width) - 1, v = 2 * (y + 0.5f) / float(height) - 1;
+        if (std::abs(u) > 1 || std::abs(v) > 1) return false;
+        const float z = 1 - std::abs(u) - std::abs(v);
+        if (z < 0) {
+          const float p = std::copysign(1 - std::abs(v), u), q = std::copysign(1 - std::abs(u), v);
+          u = p, v = q;
+        }
+        const float norm = 1 / std::sqrt(u * u + v * v + z * z);
+        d = {norm * u, norm * v, norm * z};
+        jacobian = norm * norm * norm;
+        return true;
       }
       case Kind::radial: {
         const float px = (x - cx) / fx, py = (y - cy) / fy, r = std::sqrt(px * px + py * py);
@@ -733,10 +768,23 @@ NB_MODULE(kernel, m) {
                     return Projection{.kind = Projection::Kind::latlong, .width = width,
                                       .height = height};
                   })
-      .def_static("cube",
+      .def_static("octahedral",
                   [](int width, int height) {
-                    return Projection{.kind = Projection::Kind::cube, .width = width,
+                    return Projection{.kind = Projection::Kind::octahedral, .width = width,
                                       .height = height};
+                  })
+      .def_static("cube",
+                  [](int width, int height, int face, const Table& axes, const Table& places) {
+                    if (axes.size() != 54 || places.size() != 12)
+                      throw nb::value_error("a cube has six faces");
+                    Projection p{.kind = Projection::Kind::cube, .width = width, .height = height,
+                                 .face = face};
+                    for (std::size_t k = 0; k < 6; ++k) {
+                      const float *a = axes.data() + 9 * k, *q = places.data() + 2 * k;
+                      p.faces[k] = {{a[0], a[1], a[2]}, {a[3], a[4], a[5]}, {a[6], a[7], a[8]},
+                                    q[0], q[1]};
+                    }
+                    return p;
                   })
       .def_static("radial",
                   [](int width, int height, float fx, float fy, float cx, float cy,

@@ -7,7 +7,17 @@ class Projection:
     @classmethod
     def latlong(cls, width: int, height: int, /) -> Self: ...
     @classmethod
-    def cube(cls, width: int, height: int, /) -> Self: ...
+    def octahedral(cls, width: int, height: int, /) -> Self: ...
+    @classmethod
+    def cube(
+        cls,
+        width: int,
+        height: int,
+        face: int,
+        axes: NDArray[np.float32],
+        places: NDArray[np.float32],
+        /,
+    ) -> Self: ...
     @classmethod
     def radial(
         cls,

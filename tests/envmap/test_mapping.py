@@ -9,9 +9,13 @@ import pytest
 
 from chromeball.envmap.mapping import (
     MAPPINGS,
+    SIX,
+    Cube,
     Mapping,
     Radial,
+    ball_distance,
     make_mapping,
+    mirror_ball,
     of_camera,
     parse_lens,
     pixel_grid,
@@ -25,6 +29,9 @@ OPENCV8 = [200.0, 202, 160, 118, -0.2, 0.05, 0.001, -0.001, 0, 0, 0, 0]
 
 def maps() -> dict[str, Mapping]:
     found = {name: make_mapping(name, sized(name, 96)) for name in MAPPINGS}
+    found["cube-column"] = make_mapping("cube-column", (16, 96))
+    found["ball at 3 radii"] = mirror_ball((96, 96), 3.0)
+    found["ball at 40 radii"] = mirror_ball((96, 96), 40.0)
     size = (120, 100)
     for model, fov in (("equisolid", 190), ("equidistant", 360), ("stereographic", 200)):
         lens = CameraModel.fisheye(
@@ -44,8 +51,10 @@ def maps() -> dict[str, Mapping]:
 MAPS = maps()
 #: Total solid angle of the maps that have a closed one.
 TOTALS = {
-    **dict.fromkeys(("latlong", "mirror", "angular", "cube", "equidistant"), 4 * math.pi),
-    "paraboloid": 2 * math.pi,
+    **{name: entry.total for name, entry in MAPPINGS.items()},
+    "ball at 3 radii": 2 * math.pi * (1 + math.sqrt(1 - 1 / 9)),
+    "ball at 40 radii": 2 * math.pi * (1 + math.sqrt(1 - 1 / 1600)),
+    "equidistant": 4 * math.pi,
     "equisolid": 2 * math.pi * (1 - math.cos(math.radians(95))),
     "stereographic": 2 * math.pi * (1 - math.cos(math.radians(100))),
     "orthographic": 2 * math.pi * (1 - math.cos(1.55)),
@@ -131,7 +140,10 @@ def test_kernel_agrees_with_numpy(name: str) -> None:
     assert np.median(np.abs(there[both] - back[both])) < 5e-6
 
 
-@pytest.mark.parametrize("name", ["latlong", "angular", "paraboloid", "cube", "equisolid"])
+CENTRED = [name for name in MAPPINGS if name not in ("mirror", "cube-strip", "cube-column")]
+
+
+@pytest.mark.parametrize("name", [*CENTRED, "equisolid"])
 def test_orientation(name: str) -> None:
     """Centre +Z, image right -X, up +Y."""
     mapping = MAPS[name]
@@ -156,6 +168,110 @@ def test_mirror_ball_is_a_photograph_of_a_reflection() -> None:
     d = sphere(50, seed=2)
     s = d[:, 0] / np.sqrt(2 * (d[:, 2] + 1))
     np.testing.assert_allclose(mapping.pixels_of(d)[:, 0], s * 48 + 47.5, atol=1e-9)
+
+
+@pytest.mark.parametrize("distance", [1.2, 3.0, 40.0])
+def test_ball_nearby_by_tracing_rays(distance: float) -> None:
+    """A pinhole camera on +Z looks at the unit ball: rays, hits and reflections in space."""
+    size = 200
+    mapping = mirror_ball((size, size), distance)
+    focal = size / 2 / math.tan(math.asin(1 / distance))
+    assert ball_distance(focal, size / 2) == pytest.approx(distance, rel=1e-12)
+    rng = np.random.default_rng(3)
+    r, phi = 0.999 * np.sqrt(rng.random(200)), 2 * math.pi * rng.random(200)
+    x, y = r * np.cos(phi), r * np.sin(phi)
+    pixels = np.stack([x, y], axis=-1) * size / 2 + (size - 1) / 2
+    # camera right is +X, up +Y (picture y is down)
+    ray = np.stack([x * size / 2 / focal, -y * size / 2 / focal, -np.ones(200)], axis=-1)
+    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    eye = np.array([0, 0, distance])
+    b = ray @ eye
+    hit = eye + (-b - np.sqrt(b * b - distance**2 + 1))[:, None] * ray
+    reflected = ray - 2 * np.sum(ray * hit, axis=1, keepdims=True) * hit
+    np.testing.assert_allclose(mapping.pixels_of(reflected), pixels, atol=1e-7)
+    back = mapping.unproject(pixels) @ mapping.rotation.T
+    np.testing.assert_allclose(back, reflected, atol=1e-9)
+    hidden = math.asin(1 / distance)
+    edge = [[math.sin(hidden + t), 0, -math.cos(hidden + t)] for t in (-1e-4, 1e-4)]
+    assert np.isnan(mapping.pixels_of(edge[0])).all()
+    assert np.isfinite(mapping.pixels_of(edge[1])).all()
+
+
+def test_ball_far_away_is_the_ideal_one() -> None:
+    d = sphere(500, seed=6)
+    d = d[d[:, 2] > -0.99]
+    far = mirror_ball((96, 96), 1e7).pixels_of(d)
+    np.testing.assert_allclose(far, MAPS["mirror"].pixels_of(d), atol=1e-4)
+    assert mirror_ball((96, 96), math.inf).rim == 1
+
+
+@pytest.mark.parametrize("distance", [1.0, 0.3, -2.0, math.nan])
+def test_camera_inside_the_ball(distance: float) -> None:
+    with pytest.raises(UserError, match="outside"):
+        mirror_ball((96, 96), distance)
+
+
+def test_octahedral_jacobian_and_corners() -> None:
+    """seeds' 4 / |p|^3 per du dv in small pixels; the four corners are one point, -Z."""
+    mapping = make_mapping("octahedral", (512, 512))
+    uv = 2 * (pixel_grid((512, 512)) + 0.5) / 512 - 1
+    p = np.abs(mapping.unproject(pixel_grid((512, 512))))
+    p /= p.sum(axis=-1, keepdims=True)
+    expected = 4 / np.linalg.norm(p, axis=-1) ** 3 / 512**2
+    smooth = np.abs(np.abs(uv).sum(axis=-1) - 1) > 3 / 512  # not where it is folded
+    solid = mapping.solid_angles()
+    np.testing.assert_allclose(solid[smooth], expected[smooth], rtol=3e-5)
+    np.testing.assert_allclose(solid[~smooth], expected[~smooth], rtol=5e-3)
+    corners = mapping.unproject([[-0.5, -0.5], [511.5, -0.5], [-0.5, 511.5], [511.5, 511.5]])
+    np.testing.assert_allclose(corners, [[0, 0, -1]] * 4, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["cube-vertical", "cube-strip", "cube-column"])
+def test_cube_layouts_hold_the_same_faces(name: str) -> None:
+    """Pixel for pixel the cross's, moved and (the vertical cross's back) turned by 180."""
+    cross, other = MAPS["cube"], make_mapping(name, sized(name, MAPPINGS[name].step * 24))
+    assert isinstance(other, Cube)
+    assert other.face == 24
+    d = sphere(2000, seed=9)
+    a, b = (np.round(m.project(d)).astype(int) for m in (cross, other))
+    assert len({(x // 24, y // 24) for x, y in b}) == 6
+    for x, y in ((0, 0), (23, 5)):  # a corner of each face
+        for face in other.layout:
+            q = np.array([face.column * 24 + x, face.row * 24 + y])
+            there = cross.project(other.unproject(q))
+            np.testing.assert_allclose(there, np.round(there), atol=1e-9)
+    assert len(np.unique(a, axis=0)) == len(np.unique(b, axis=0))
+
+
+def test_strip_is_in_the_order_of_opengl() -> None:
+    """OpenGL 4.6, table 8.19: s to the right, t down; its cube's x is image right."""
+    mapping, n = make_mapping("cube-strip", (96, 16)), 16
+    assert SIX == ("px", "nx", "py", "ny", "pz", "nz")
+    for d in sphere(200, seed=10):
+        # our world's +X is the cube's -X: seen from inside, unmirrored, as three.js turns it
+        r = np.array([-d[0], d[1], d[2]])
+        axis = int(np.abs(r).argmax())
+        face = 2 * axis + (r[axis] < 0)
+        s, t = {
+            0: (-r[2], -r[1]),
+            1: (r[2], -r[1]),
+            2: (r[0], r[2]),
+            3: (r[0], -r[2]),
+            4: (r[0], -r[1]),
+            5: (-r[0], -r[1]),
+        }[face]
+        a, b = (s / abs(r[axis]) + 1) / 2, (t / abs(r[axis]) + 1) / 2
+        np.testing.assert_allclose(
+            mapping.pixels_of(d), [face * n + a * n - 0.5, b * n - 0.5], atol=1e-9
+        )
+
+
+def test_names_of_the_command_line_are_the_table() -> None:
+    from typing import get_args
+
+    from chromeball.envmap.names import Name
+
+    assert set(get_args(Name.__value__)) == set(MAPPINGS)
 
 
 def test_angular_map_formula() -> None:
@@ -185,7 +301,8 @@ def test_bad_lens_spec(spec: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "size"), [("latlong", (100, 100)), ("mirror", (10, 9)), ("cube", (12, 8))]
+    ("name", "size"),
+    [("latlong", (100, 100)), ("mirror", (10, 9)), ("cube", (12, 8)), ("octahedral", (5, 5))],
 )
 def test_wrong_shape(name: str, size: tuple[int, int]) -> None:
     with pytest.raises(UserError, match="must be"):

@@ -21,7 +21,12 @@ from chromeball.envmap.probe import rotation
 from chromeball.envmap.resample import warp
 from chromeball.scene.camera import CameraModel
 
-NAMES = [name for name in MAPPINGS if name != "paraboloid"]
+NAMES = [name for name, entry in MAPPINGS.items() if entry.total > 12]
+
+
+def at_width(name: str, width: int) -> Mapping:
+    """About that width: faces of a cube are whole pixels."""
+    return make_mapping(name, sized(name, width - width % MAPPINGS[name].step))
 
 
 def fisheye(size: int, fov: float = 190.0) -> Mapping:
@@ -69,7 +74,7 @@ def suns(count: int, seed: int) -> NDArray[np.float64]:
 @pytest.mark.parametrize("width", [24, 128])
 def test_constant_stays_constant(to: str, width: int) -> None:
     source = LatLong((96, 48))
-    target = fisheye(width) if to == "fisheye" else make_mapping(to, sized(to, width))
+    target = fisheye(width) if to == "fisheye" else at_width(to, width)
     result = warp(np.full((48, 96, 3), 0.7, np.float32), source, target)
     seen = target.solid_angles() > 0
     np.testing.assert_allclose(result.radiance[seen], 0.7, rtol=1e-5)
@@ -81,7 +86,7 @@ def test_constant_stays_constant(to: str, width: int) -> None:
 @pytest.mark.parametrize("width", [96, 320])
 def test_smooth_radiance_against_the_analytic_function(to: str, width: int) -> None:
     source = LatLong((320, 160))
-    target = make_mapping(to, sized(to, width))
+    target = at_width(to, width)
     result = warp(area_mean(source, 2), source, target)
     solid = target.solid_angles()
     # the sub-samples of a reference pixel that a rim cuts are not comparable
@@ -110,7 +115,7 @@ def test_fisheye_to_latlong_keeps_a_sun(position: int, width: int) -> None:
 @pytest.mark.parametrize("width", [48, 320])
 def test_every_map_keeps_suns(to: str, width: int) -> None:
     source = LatLong((256, 128))
-    target = make_mapping(to, sized(to, width))
+    target = at_width(to, width)
     poles = np.array([[0, 1, 0], [0, -1, 0], [0, 0, -1], [-1e-3, 0, -1]], float)
     for sun in np.concatenate([suns(4, 6), poles]):
         sun = sun / np.linalg.norm(sun)
@@ -133,7 +138,7 @@ def test_hot_texels_alone_are_kept_exactly() -> None:
         radiance = np.zeros((32, 64, 3), np.float32)
         radiance[y, x] = [1e5, 5e4, 1e3]
         for name in NAMES:
-            result = warp(radiance, source, make_mapping(name, sized(name, 160)))
+            result = warp(radiance, source, at_width(name, 160))
             np.testing.assert_allclose(result.energy, radiance[y, x] * solid[y, x], rtol=2e-3)
 
 

@@ -1,0 +1,68 @@
+"""What every map of the sphere can do; axes, pixel centres, units are said in the package."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from chromeball.envmap.kernel import Projection
+from chromeball.scene.camera import WORLD_FROM_LATLONG
+
+type Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Mapping(ABC):
+    """A picture of the sphere: ``size`` is width and height in pixels."""
+
+    size: tuple[int, int]
+    rotation: Array = field(default_factory=lambda: WORLD_FROM_LATLONG.rotation)
+
+    def turned(self, world_from_camera: Array) -> Mapping:
+        """The same picture, turned in the world."""
+        return replace(self, rotation=np.asarray(world_from_camera, float))
+
+    @abstractmethod
+    def project(self, directions: ArrayLike) -> Array:
+        """Directions in camera axes to pixels, ``(..., 3) -> (..., 2)``; NaN where unseen."""
+
+    @abstractmethod
+    def unproject(self, pixels: ArrayLike) -> Array:
+        """Pixels to unit directions in camera axes, ``(..., 2) -> (..., 3)``; NaN outside."""
+
+    @abstractmethod
+    def solid_angles(self) -> Array:
+        """Exact solid angle of the valid part of each pixel, (H, W) steradians."""
+
+    @cached_property
+    @abstractmethod
+    def kernel(self) -> Projection:
+        """The same mapping for the C++ kernel."""
+
+    def pixels_of(self, world: ArrayLike) -> Array:
+        """Directions in world axes to pixels, ``(..., 3) -> (..., 2)``; NaN where unseen."""
+        return self.project(np.asarray(world, float) @ self.rotation)
+
+    def directions(self) -> Array:
+        """World directions of all pixel centres, (H, W, 3); NaN outside the map."""
+        return self.unproject(pixel_grid(self.size)) @ self.rotation.T
+
+
+def pixel_grid(size: tuple[int, int], offset: float = 0.0, more: int = 0) -> Array:
+    """All pixel centres moved by `offset`, ``(H + more, W + more, 2)``, x first."""
+    x, y = np.meshgrid(
+        np.arange(size[0] + more, dtype=float) + offset,
+        np.arange(size[1] + more, dtype=float) + offset,
+    )
+    return np.stack([x, y], axis=-1)
+
+
+def triangle(a: Array, b: Array, c: Array) -> Array:
+    """Solid angle of spherical triangles (Van Oosterom and Strackee 1983)."""
+    triple = np.sum(a * np.cross(b, c), axis=-1)
+    ab, bc, ca = (np.sum(u * v, axis=-1) for u, v in ((a, b), (b, c), (c, a)))
+    return 2 * np.arctan2(triple, 1 + ab + bc + ca)

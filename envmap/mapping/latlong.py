@@ -1,0 +1,44 @@
+"""Longitude across, latitude down."""
+
+from __future__ import annotations
+
+import math
+from functools import cached_property
+from typing import override
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from chromeball.envmap.kernel import Projection
+from chromeball.envmap.mapping.base import Array, Mapping
+from chromeball.scene.camera import CameraModel
+
+
+class LatLong(Mapping):
+    """Longitude across, latitude down; a 2:1 panorama."""
+
+    @cached_property
+    def _camera(self) -> CameraModel:
+        return CameraModel.latlong(self.size)
+
+    @override
+    def project(self, directions: ArrayLike) -> Array:
+        return self._camera.project(directions)
+
+    @override
+    def unproject(self, pixels: ArrayLike) -> Array:
+        return self._camera.unproject(pixels)
+
+    @override
+    def solid_angles(self) -> Array:
+        width, height = self.size
+        edges = np.linspace(-math.pi / 2, math.pi / 2, height + 1)
+        # sin b - sin a without cancellation
+        middle, half = (edges[1:] + edges[:-1]) / 2, math.pi / (2 * height)
+        row = 2 * np.cos(middle) * math.sin(half) * (2 * math.pi / width)
+        return np.repeat(row[:, None], width, axis=1)
+
+    @cached_property
+    @override
+    def kernel(self) -> Projection:
+        return Projection.latlong(*self.size)
