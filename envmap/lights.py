@@ -1,26 +1,37 @@
 """N lights from a map (seeds.md P16): variance cut, Viriyothai and Debevec 2009.
 
 The map is cut again and again, always the region with the largest spread of energy about its
-centroid, where that spread shrinks most. Every region becomes a light: sum L dOmega is kept.
+centroid, where that spread shrinks most; then the borders relax (Lloyd 1982), for less spread
+yet. Every region becomes a light: sum L dOmega is kept. What is wrong with so few directions is
+kept as order-2 harmonics of the difference, the ambient.
 """
 
 from __future__ import annotations
 
-import heapq
 import math
-from dataclasses import dataclass
+import os
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from chromeball.envmap.harmonics import sh_basis, sh_irradiance
+from chromeball.envmap.lights_kernel import moments, summary
+from chromeball.envmap.lights_kernel import variance_cut as cut
 from chromeball.envmap.mapping import LatLong
 from chromeball.scene.color import LUMINANCE
 from chromeball.scene.errors import UserError
+from chromeball.scene.record import read_json
 
 type Array = NDArray[np.float64]
 
 #: The six normals for which irradiance is compared: +X -X +Y -Y +Z -Z.
 NORMALS = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], float)
+#: Cells of the lattice that is cut, down and across.
+_ROWS, _COLUMNS = 64, 128
+#: Steps of relaxation, and the most lights that are worth it.
+_STEPS, _RELAXED = 4, 1024
 
 
 @dataclass(frozen=True)
@@ -28,15 +39,20 @@ class Lights:
     """Light samples of a map.
 
     ``directions`` (N, 3) unit, world, at the energy's centroid; ``radiance`` (N, 3), the mean
-    over the region; ``solid_angles`` (N,) sr; ``positions`` (N, 3) metres, NaN where unknown;
-    ``ambient`` (9, 3), real spherical harmonics of what the lights leave out, or None.
-    ``total`` (3,) is the map's sum L dOmega; ``irradiance`` (6, 3) on NORMALS.
+    over the region; ``solid_angles`` (N,) sr, the region's; ``angular_radii`` (N,), radians, of
+    the disc over which the region's light is as spread as it is (a small lamp in a large dark
+    region is small); ``positions`` (N, 3) metres, NaN where unknown, and ``distances`` (N,)
+    from the map's place. ``ambient`` (9, 3), real spherical harmonics of what the lights leave
+    out, or None; it may be negative in places. ``total`` (3,) is the map's sum L dOmega;
+    ``irradiance`` (6, 3) the map's on NORMALS.
     """
 
     directions: Array
     radiance: Array
     solid_angles: Array
+    angular_radii: Array
     positions: Array
+    distances: Array
     ambient: Array | None
     total: Array
     irradiance: Array
@@ -51,20 +67,29 @@ class Lights:
         return result
 
     def to_json(self) -> dict[str, object]:
-        """The content of lights.json."""
-        known = np.isfinite(self.positions).all(axis=1)
+        """The content of lights.json.
+
+        A light at a place has a ``radius`` (m), too, of the disc that faces the map's place,
+        and its ``intensity`` (W/sr): L dOmega times the distance squared.
+        """
+        lights: list[dict[str, object]] = []
+        for k, direction in enumerate(self.directions):
+            light: dict[str, object] = {
+                "direction": direction,
+                "radiance": self.radiance[k],
+                "solid_angle": self.solid_angles[k],
+                "angular_radius": self.angular_radii[k],
+                "position": None,
+            }
+            if np.isfinite(self.positions[k]).all():
+                away = float(self.distances[k])
+                light["position"] = self.positions[k]
+                light["radius"] = away * math.tan(float(self.angular_radii[k]))
+                energy = self.radiance[k] * self.solid_angles[k]
+                light["intensity"] = energy * away**2
+            lights.append(light)
         return {
-            "lights": [
-                {"direction": d, "radiance": r, "solid_angle": s, "position": p if ok else None}
-                for d, r, s, p, ok in zip(
-                    self.directions,
-                    self.radiance,
-                    self.solid_angles,
-                    self.positions,
-                    known,
-                    strict=True,
-                )
-            ],
+            "lights": lights,
             "ambient": self.ambient,
             "total": self.total,
             "irradiance": {
@@ -75,164 +100,175 @@ class Lights:
         }
 
 
+def read_lights(path: str | os.PathLike[str]) -> Lights:
+    """Read lights.json.
+
+    Raises
+    ------
+    UserError
+        When the file is missing or no list of lights.
+
+    """
+    value = read_json(path)
+    try:
+        entries: list[dict[str, Any]] = value["lights"]
+        unknown = [math.nan] * 3
+        place = [unknown if v["position"] is None else v["position"] for v in entries]
+        positions = np.array(place, float).reshape(-1, 3)
+        known = np.isfinite(positions).all(axis=1)
+        radiance = np.array([v["radiance"] for v in entries], float)
+        solid = np.array([v["solid_angle"] for v in entries], float)
+        intensity = np.array([v.get("intensity", unknown) for v in entries], float)
+        energy = (radiance * solid[:, None]) @ LUMINANCE
+        lit = known & (energy > 0)
+        distances = np.full(len(entries), math.nan)
+        distances[lit] = np.sqrt((intensity @ LUMINANCE)[lit] / energy[lit])
+        return Lights(
+            directions=np.array([v["direction"] for v in entries], float),
+            radiance=radiance,
+            solid_angles=solid,
+            angular_radii=np.array([v["angular_radius"] for v in entries], float),
+            positions=positions,
+            distances=distances,
+            ambient=None if value["ambient"] is None else np.array(value["ambient"], float),
+            total=np.array(value["total"], float),
+            irradiance=np.array(value["irradiance"]["map"], float),
+        )
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise UserError(f"not a lights.json of `envmap lights`: {error}", file=path) from error
+
+
 def variance_cut(
     radiance: NDArray[np.float32],
     count: int,
     *,
     depth: NDArray[np.float32] | None = None,
     origin: ArrayLike = (0, 0, 0),
-    ambient: bool = False,
+    ambient: bool = True,
 ) -> Lights:
     """At most `count` lights from a lat-long map (H, W, 3).
 
     `depth` (H, W) in metres from `origin` gives positions; infinite or non-positive depth is
-    a light far away. With `ambient`, the order-2 harmonics of the residual are kept.
+    a light far away. Without `ambient` the lights alone stand for the map, and their ambient
+    is None.
 
     Raises
     ------
     UserError
-        When the map is black.
+        When the map is black, or a pixel is negative or not finite.
 
     """
-    height, width = radiance.shape[:2]
-    mapping = LatLong((width, height))
-    solid = mapping.solid_angles()
-    d = mapping.directions()
-    energy_rgb = radiance.astype(float) * solid[..., None]
-    energy = energy_rgb @ LUMINANCE
-    if not energy.sum() > 0:
+    source = fine_enough(radiance)
+    cells, bad = moments(source, *_lattice(source.shape, count))
+    if bad:
+        raise UserError(f"{bad} pixels are NaN, infinite or negative")
+    harmonics, irradiance = summary(cells)
+    total = harmonics[0] * math.sqrt(4 * math.pi)
+    if not total.sum() > 0:
         raise UserError("the map is black: there is no light in it")
-    # summed-area tables of E and E w
-    table = np.zeros((height + 1, width + 1, 4))
-    moments = np.concatenate([energy[..., None], energy[..., None] * d], axis=-1)
-    table[1:, 1:] = moments.cumsum(axis=0).cumsum(axis=1)
-
-    # the region with the largest spread first; the counter settles ties
-    heap: list[tuple[float, int, tuple[int, int, int, int]]] = []
-    whole = (0, height, 0, width)
-    heapq.heappush(heap, (-float(_spread(_sum(table, whole))), 0, whole))
-    leaves: list[tuple[int, int, int, int]] = []
-    made = 1
-    while heap and len(heap) + len(leaves) < count:
-        spread, _, region = heapq.heappop(heap)
-        # what remains of rounding in a region of one point of light
-        if -spread <= 1e-12 * float(table[-1, -1, 0]):
-            leaves.append(region)
-            continue
-        parts = _cut(table, region)
-        if not parts:
-            leaves.append(region)
-        for part in parts:
-            heapq.heappush(heap, (-float(_spread(_sum(table, part))), made, part))
-            made += 1
-    leaves += [region for *_, region in heap]
-    leaves.sort()
-
-    n = len(leaves)
-    directions, means, solids = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros(n)
-    positions = np.full((n, 3), np.nan)
-    for k, (y0, y1, x0, x1) in enumerate(leaves):
-        here = np.s_[y0:y1, x0:x1]
-        e, w, s = energy[here], d[here], solid[here]
-        solids[k] = s.sum()
-        means[k] = energy_rgb[here].sum(axis=(0, 1)) / solids[k]
-        weight = e if e.sum() > 0 else s
-        m = np.einsum("ij,ijk->k", weight, w)
-        norm = np.linalg.norm(m)
-        directions[k] = m / norm if norm > 0 else w[0, 0]
-        if depth is not None:
-            z = depth[here].astype(float)
-            near = np.isfinite(z) & (z > 0)
-            if weight[near].sum() > weight.sum() / 2:
-                p = (w * z[..., None])[near] * weight[near][:, None]
-                positions[k] = p.sum(axis=0) / weight[near].sum() + np.asarray(origin, float)
-    total = energy_rgb.sum(axis=(0, 1))
-    residual = None
-    if ambient:
-        map_sh = np.zeros((9, 3))
-        for row, here in zip(d, energy_rgb, strict=True):  # a row at a time: memory
-            map_sh += sh_basis(row).T @ here
-        lights_sh = sh_basis(directions).T @ (means * solids[:, None])
-        residual = map_sh - lights_sh
-    irradiance = np.stack(
-        [np.einsum("hw,hwc->c", np.maximum(d @ normal, 0), energy_rgb) for normal in NORMALS]
-    )
-    return Lights(
+    labels, sums = cut(cells, count, _STEPS if count <= _RELAXED else 0)
+    solid = _solid_angles(labels, len(sums))
+    sums = sums.reshape(-1, 4, 3)
+    energy = sums @ LUMINANCE  # E and its first moment
+    lit = energy[:, 0] > 0
+    m = energy[:, 1:]
+    if not lit.all():
+        m = np.where(lit[:, None], m, _middles(labels, len(sums)))
+    norm = np.linalg.norm(m, axis=1)
+    directions = m / np.where(norm > 0, norm, 1)[:, None]
+    directions[norm == 0] = [0, 0, 1]
+    share = np.where(lit, norm / np.where(lit, energy[:, 0], 1), 1)
+    result = Lights(
         directions=directions,
-        radiance=means,
-        solid_angles=solids,
-        positions=positions,
-        ambient=residual,
+        radiance=sums[:, 0] / solid[:, None],
+        solid_angles=solid,
+        angular_radii=disc_radius(share),
+        positions=np.full(directions.shape, np.nan),
+        distances=np.full(len(directions), np.nan),
+        ambient=None,
         total=total,
         irradiance=irradiance,
     )
+    if ambient:
+        result = replace(result, ambient=harmonics - sh_basis(directions).T @ sums[:, 0])
+    if depth is not None:
+        result = _placed(result, radiance, depth, labels, origin)
+    return result
 
 
-def _sum(table: Array, region: tuple[int, int, int, int]) -> Array:
-    y0, y1, x0, x1 = region
-    return table[y1, x1] - table[y0, x1] - table[y1, x0] + table[y0, x0]
+def disc_radius(share: ArrayLike) -> Array:
+    """Angular radius of an even disc whose mean direction has the length `share`.
+
+    A cap of radius a has (1 + cos a) / 2; never more than a hemisphere.
+    """
+    return np.arccos(np.clip(2 * np.asarray(share, float) - 1, 0, 1))
 
 
-def _spread(moments: Array) -> Array:
-    """E - |m|^2 / E: the energy's variance about its centroid on the sphere."""
-    e = np.maximum(moments[..., 0], 0)
-    m2 = np.sum(moments[..., 1:] ** 2, axis=-1)
-    return np.asarray(np.maximum(e - m2 / np.where(e > 0, e, 1), 0))
+def fine_enough(radiance: NDArray[np.float32], width: int = 64) -> NDArray[np.float32]:
+    """The same map with its pixels split where it is smaller than `width`."""
+    radiance = np.ascontiguousarray(radiance, np.float32)
+    times = math.ceil(width / radiance.shape[1])
+    down = math.ceil(width / 2 / radiance.shape[0])
+    if times > 1:
+        radiance = np.repeat(radiance, times, axis=1)
+    if down > 1:
+        radiance = np.repeat(radiance, down, axis=0)
+    return radiance
 
 
-def _cut(
-    table: Array, region: tuple[int, int, int, int]
-) -> tuple[tuple[int, int, int, int], tuple[int, int, int, int]] | tuple[()]:
-    """The cut into two that leaves the least spread."""
-    y0, y1, x0, x1 = region
-    whole = _sum(table, region)
-    best, parts = math.inf, None
-    if y1 - y0 > 1:
-        rows = np.arange(y0 + 1, y1)
-        upper = table[rows, x1] - table[y0, x1] - table[rows, x0] + table[y0, x0]
-        cost = _spread(upper) + _spread(whole - upper)
-        k = int(np.argmin(cost))
-        best, y = float(cost[k]), int(rows[k])
-        parts = (y0, y, x0, x1), (y, y1, x0, x1)
-    if x1 - x0 > 1:
-        columns = np.arange(x0 + 1, x1)
-        left = table[y1, columns] - table[y0, columns] - table[y1, x0] + table[y0, x0]
-        cost = _spread(left) + _spread(whole - left)
-        k = int(np.argmin(cost))
-        if float(cost[k]) < best:
-            x = int(columns[k])
-            parts = (y0, y1, x0, x), (y0, y1, x, x1)
-    return parts or ()
+def _lattice(shape: tuple[int, ...], count: int) -> tuple[int, int]:
+    """Rows and columns, more for very many lights: 32 cells a light."""
+    more = max(1.0, math.sqrt(32 * count / (_ROWS * _COLUMNS)))
+    return min(int(_ROWS * more), shape[0]), min(int(_COLUMNS * more), shape[1])
 
 
-# ---- spherical harmonics of order 2, real and orthonormal
+def _solid_angles(labels: NDArray[np.int32], count: int) -> Array:
+    """Of the lights' regions, (N,)."""
+    rows, columns = labels.shape
+    solid = -np.diff(np.sin(math.pi * (0.5 - np.arange(rows + 1) / rows)))
+    solid *= 2 * math.pi / columns
+    return np.bincount(labels.ravel(), np.repeat(solid, columns), count)
 
-#: Convolution with the clamped cosine (Ramamoorthi and Hanrahan 2001), for each coefficient.
-COSINE = np.array([math.pi] + 3 * [2 * math.pi / 3] + 5 * [math.pi / 4])
+
+def _middles(labels: NDArray[np.int32], count: int) -> Array:
+    """Integrals of w over the lights' regions, (N, 3)."""
+    d = LatLong((labels.shape[1], labels.shape[0])).directions()
+    d *= np.sqrt(1 - d[..., 1:2] ** 2)
+    flat = labels.ravel()
+    return np.stack([np.bincount(flat, d[..., k].ravel(), count) for k in range(3)], axis=1)
 
 
-def sh_basis(d: ArrayLike) -> Array:
-    """Y_00, Y_1-1 .. Y_22 at unit directions, ``(..., 3) -> (..., 9)``; axes x, y, z."""
-    v = np.asarray(d, float)
-    x, y, z = v[..., 0], v[..., 1], v[..., 2]
-    one = np.ones_like(x)
-    a, b = math.sqrt(3 / (4 * math.pi)), math.sqrt(15 / (4 * math.pi))
-    return np.stack(
-        [
-            one / math.sqrt(4 * math.pi),
-            a * y,
-            a * z,
-            a * x,
-            b * x * y,
-            b * y * z,
-            math.sqrt(5 / (16 * math.pi)) * (3 * z * z - 1),
-            b * x * z,
-            b / 2 * (x * x - y * y),
-        ],
-        axis=-1,
+def _placed(
+    lights: Lights,
+    radiance: NDArray[np.float32],
+    depth: NDArray[np.float32],
+    labels: NDArray[np.int32],
+    origin: ArrayLike,
+) -> Lights:
+    """With the places of those lights most of whose energy has a finite depth: its centroid."""
+    count, (height, width) = len(lights.directions), depth.shape
+    lon = (np.arange(width) + 0.5) * 2 * math.pi / width - math.pi
+    rows, columns = labels.shape
+    column = np.arange(width) * columns // width
+    near_sums, all_sums = np.zeros((count, 4)), np.zeros(count)
+    for y in range(height):
+        lat = math.pi * (0.5 - (y + 0.5) / height)
+        z = depth[y].astype(float)
+        near = np.isfinite(z) & (z > 0)
+        # a trace for the dark: their middle
+        weight = (radiance[y] @ LUMINANCE + 1e-30) * math.cos(lat)
+        label = labels[y * rows // height][column]
+        all_sums += np.bincount(label, weight, count)
+        weight, z = np.where(near, weight, 0), np.where(near, z, 0)
+        level = math.cos(lat)
+        w = (-np.sin(lon) * level, np.full(width, math.sin(lat)), np.cos(lon) * level)
+        for k, value in enumerate((np.ones(width), *(v * z for v in w))):
+            near_sums[:, k] += np.bincount(label, weight * value, count)
+    known = near_sums[:, 0] > all_sums / 2
+    p = np.full((count, 3), np.nan)
+    p[known] = near_sums[known, 1:] / near_sums[known, :1]
+    return replace(
+        lights,
+        positions=p + np.asarray(origin, float),
+        distances=np.linalg.norm(p, axis=1),
     )
-
-
-def sh_irradiance(coefficients: ArrayLike, normals: ArrayLike) -> Array:
-    """Irradiance on `normals` (..., 3) of radiance given by (9, 3) coefficients."""
-    return (sh_basis(normals) * COSINE) @ np.asarray(coefficients, float)
