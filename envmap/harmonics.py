@@ -1,7 +1,7 @@
 """Real spherical harmonics of a map, and the irradiance that they give.
 
-Y_lm are orthonormal, in the order (0, 0), (1, -1), (1, 0), (1, 1), (2, -2) ..., with signs as in
-Ramamoorthi and Hanrahan 2001 (no Condon-Shortley phase): Y_1-1, Y_10, Y_11 go with y, z, x.
+Y_lm are orthonormal, in the order (0, 0), (1, -1), (1, 0), (1, 1), (2, -2) ..., with signs as
+in Ramamoorthi and Hanrahan 2001 (no Condon-Shortley phase): Y_1-1, Y_10, Y_11 go with y, z, x.
 """
 
 from __future__ import annotations

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -135,7 +136,7 @@ def read_lights(path: str | os.PathLike[str]) -> Lights:
             irradiance=np.array(value["irradiance"]["map"], float),
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise UserError(f"not a lights.json of `envmap lights`: {error}", file=path) from error
+        raise UserError(f"no list of lights by `envmap lights`: {error}", file=path) from error
 
 
 def variance_cut(
@@ -158,42 +159,78 @@ def variance_cut(
         When the map is black, or a pixel is negative or not finite.
 
     """
-    source = fine_enough(radiance)
-    cells, bad = moments(source, *_lattice(source.shape, count))
-    if bad:
-        raise UserError(f"{bad} pixels are NaN, infinite or negative")
-    harmonics, irradiance = summary(cells)
-    total = harmonics[0] * math.sqrt(4 * math.pi)
-    if not total.sum() > 0:
-        raise UserError("the map is black: there is no light in it")
-    labels, sums = cut(cells, count, _STEPS if count <= _RELAXED else 0)
-    solid = _solid_angles(labels, len(sums))
-    sums = sums.reshape(-1, 4, 3)
-    energy = sums @ LUMINANCE  # E and its first moment
-    lit = energy[:, 0] > 0
-    m = energy[:, 1:]
-    if not lit.all():
-        m = np.where(lit[:, None], m, _middles(labels, len(sums)))
-    norm = np.linalg.norm(m, axis=1)
-    directions = m / np.where(norm > 0, norm, 1)[:, None]
-    directions[norm == 0] = [0, 0, 1]
-    share = np.where(lit, norm / np.where(lit, energy[:, 0], 1), 1)
-    result = Lights(
-        directions=directions,
-        radiance=sums[:, 0] / solid[:, None],
-        solid_angles=solid,
-        angular_radii=disc_radius(share),
-        positions=np.full(directions.shape, np.nan),
-        distances=np.full(len(directions), np.nan),
-        ambient=None,
-        total=total,
-        irradiance=irradiance,
+    sky = survey(radiance, *_lattice(count))
+    labels, sums = cut(sky.cells, count, _STEPS if count <= _RELAXED else 0)
+    result = sky.lights(
+        sums.reshape(-1, 4, 3),
+        _solid_angles(labels, len(sums)),
+        lambda: _middles(labels, len(sums)),
+        ambient=ambient,
     )
-    if ambient:
-        result = replace(result, ambient=harmonics - sh_basis(directions).T @ sums[:, 0])
     if depth is not None:
         result = _placed(result, radiance, depth, labels, origin)
     return result
+
+
+@dataclass(frozen=True)
+class Survey:
+    """A map on a coarse lattice.
+
+    ``cells`` (rows, columns, 12): integrals of L, L x, L y, L z over a cell, each R, G, B;
+    ``harmonics`` (9, 3) and ``irradiance`` (6, 3) of the whole.
+    """
+
+    cells: Array
+    harmonics: Array
+    irradiance: Array
+
+    def lights(
+        self, sums: Array, solid: Array, middles: Callable[[], Array], *, ambient: bool
+    ) -> Lights:
+        """Lights of regions with moments `sums` (N, 4, 3) and solid angles (N,).
+
+        `middles` gives directions (N, 3) of any length for regions that are dark.
+        """
+        energy = sums @ LUMINANCE
+        lit = energy[:, 0] > 0
+        m = energy[:, 1:]
+        if not lit.all():
+            m = np.where(lit[:, None], m, middles())
+        norm = np.linalg.norm(m, axis=1)
+        directions = m / np.where(norm > 0, norm, 1)[:, None]
+        directions[norm == 0] = [0, 0, 1]
+        share = np.where(lit, norm / np.where(lit, energy[:, 0], 1), 1)
+        left = self.harmonics - sh_basis(directions).T @ sums[:, 0] if ambient else None
+        return Lights(
+            directions=directions,
+            radiance=sums[:, 0] / solid[:, None],
+            solid_angles=solid,
+            angular_radii=disc_radius(share),
+            positions=np.full(directions.shape, np.nan),
+            distances=np.full(len(directions), np.nan),
+            ambient=left,
+            total=self.harmonics[0] * math.sqrt(4 * math.pi),
+            irradiance=self.irradiance,
+        )
+
+
+def survey(radiance: NDArray[np.float32], rows: int, columns: int) -> Survey:
+    """A map (H, W, 3) on a lattice of at most `rows` x `columns`.
+
+    Raises
+    ------
+    UserError
+        When the map is black, or a pixel is negative or not finite.
+
+    """
+    source = fine_enough(radiance)
+    cells, bad = moments(source, min(rows, source.shape[0]), min(columns, source.shape[1]))
+    if bad:
+        raise UserError(f"{bad} pixels are NaN, infinite or negative")
+    harmonics, irradiance = summary(cells)
+    if not harmonics[0].sum() > 0:
+        raise UserError("the map is black: there is no light in it")
+    return Survey(cells, harmonics, irradiance)
 
 
 def disc_radius(share: ArrayLike) -> Array:
@@ -216,10 +253,10 @@ def fine_enough(radiance: NDArray[np.float32], width: int = 64) -> NDArray[np.fl
     return radiance
 
 
-def _lattice(shape: tuple[int, ...], count: int) -> tuple[int, int]:
+def _lattice(count: int) -> tuple[int, int]:
     """Rows and columns, more for very many lights: 32 cells a light."""
     more = max(1.0, math.sqrt(32 * count / (_ROWS * _COLUMNS)))
-    return min(int(_ROWS * more), shape[0]), min(int(_COLUMNS * more), shape[1])
+    return int(_ROWS * more), int(_COLUMNS * more)
 
 
 def _solid_angles(labels: NDArray[np.int32], count: int) -> Array:

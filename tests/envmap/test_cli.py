@@ -121,7 +121,10 @@ def test_explicit_files(folder: Path, capsys: pytest.CaptureFixture[str]) -> Non
     )
     check_panorama(build / "env.exr")
     capsys.readouterr()
-    run("envmap", "lights", build / "env.exr", "--count", 20, "-o", build / "l.json", "--json")
+    run(
+        *("envmap", "lights", build / "env.exr", "--count", 20, "--no-ambient", "--json"),
+        *("-o", build / "l.json"),
+    )
     figures = json.loads(capsys.readouterr().out)
     assert figures["lights"] == 20
     value = read_json(build / "l.json")
@@ -148,7 +151,7 @@ def test_camera_file_and_positions(folder: Path) -> None:
     depth = np.full((16, 32, 1), 2.5, np.float32)
     write_exr(build / "depth.exr", depth, channels=("Z",))
     run(
-        *("envmap", "lights", build / "env.exr", "--depth", build / "depth.exr", "--ambient"),
+        *("envmap", "lights", build / "env.exr", "--depth", build / "depth.exr"),
         *("--count", 8, "-o", build / "lights.json"),
     )
     value = read_json(build / "lights.json")

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
-
-from cyclopts import Parameter
+from typing import Any, Literal
 
 from chromeball.cli.envmap.arguments import Json, Out, print_figures
 from chromeball.scene.errors import UserError
@@ -17,11 +15,13 @@ def lights(
     *,
     count: int = 64,
     depth: Path | None = None,
-    ambient: Annotated[bool, Parameter(negative="")] = False,
+    method: Literal["variance-cut", "grid", "random"] = "variance-cut",
+    seed: int = 0,
+    ambient: bool = True,
     output: Out,
     json: Json = False,
 ) -> None:
-    """A map as light samples of the same total irradiance (variance cut).
+    """A map as light samples of the same total irradiance.
 
     Parameters
     ----------
@@ -31,6 +31,12 @@ def lights(
         How many lights at most.
     depth
         A light-depth map, env_depth.exr: the lights get positions.
+    method
+        variance-cut (Viriyothai and Debevec 2009) is the most accurate; grid takes the bright
+        cells of a grid (Pomi 2005), the dimmer of them merged into the brighter; random a
+        random sub-list of those cells.
+    seed
+        Of the random sub-list.
     ambient
         Keep the order-2 harmonics of what the lights leave out.
     output
@@ -41,6 +47,7 @@ def lights(
     """
     import numpy as np
 
+    from chromeball.envmap.grid import grid_lights
     from chromeball.envmap.lights import variance_cut
     from chromeball.envmap.mapping import LatLong, make_mapping
     from chromeball.envmap.picture import read_radiance, tone_mapped, write_preview
@@ -48,6 +55,10 @@ def lights(
 
     if not 1 <= count <= 65536:
         raise UserError(f"--count {count}: between 1 and 65536 lights")
+    if method != "variance-cut" and depth is not None:
+        raise UserError("--depth is for the variance cut: cells of a grid have no one place")
+    if seed and method != "random":
+        raise UserError("--seed is for --method random")
     image = read_radiance(env)
     radiance, size, kept = image.rgb, image.size, image.attributes
     try:
@@ -62,15 +73,21 @@ def lights(
             "`envmap probe --align`",
             file=env,
         )
-    with Stage("envmap lights", [env, *([depth] if depth else [])], count=count) as stage:
+    inputs = [env, *([depth] if depth else [])]
+    options = {"count": count, "method": method, "seed": seed, "ambient": ambient}
+    with Stage("envmap lights", inputs, **options) as stage:
         try:
-            result = variance_cut(
-                radiance,
-                count,
-                depth=distance,
-                origin=np.zeros(3) if origin is None else np.ravel(origin),
-                ambient=ambient,
-            )
+            if method == "variance-cut":
+                result = variance_cut(
+                    radiance,
+                    count,
+                    depth=distance,
+                    origin=np.zeros(3) if origin is None else np.ravel(origin),
+                    ambient=ambient,
+                )
+            else:
+                pick: Literal["merged", "random"] = "merged" if method == "grid" else "random"
+                result = grid_lights(radiance, count, pick=pick, seed=seed, ambient=ambient)
         except UserError as error:
             raise UserError(error.what, file=env) from error
         own = result.own_irradiance()
