@@ -163,7 +163,7 @@ def variance_cut(
     labels, sums = cut(sky.cells, count, _STEPS if count <= _RELAXED else 0)
     result = sky.lights(
         sums.reshape(-1, 4, 3),
-        _solid_angles(labels, len(sums)),
+        _solid_angles(labels, sky.size, len(sums)),
         lambda: _middles(labels, len(sums)),
         ambient=ambient,
     )
@@ -177,9 +177,11 @@ class Survey:
     """A map on a coarse lattice.
 
     ``cells`` (rows, columns, 12): integrals of L, L x, L y, L z over a cell, each R, G, B;
-    ``harmonics`` (9, 3) and ``irradiance`` (6, 3) of the whole.
+    ``harmonics`` (9, 3) and ``irradiance`` (6, 3) of the whole; ``size``: rows and columns of
+    the pixels that the cells are made of.
     """
 
+    size: tuple[int, int]
     cells: Array
     harmonics: Array
     irradiance: Array
@@ -223,14 +225,14 @@ def survey(radiance: NDArray[np.float32], rows: int, columns: int) -> Survey:
         When the map is black, or a pixel is negative or not finite.
 
     """
-    source = fine_enough(radiance)
+    source = fine_enough(radiance, min(columns // 2, 256))
     cells, bad = moments(source, min(rows, source.shape[0]), min(columns, source.shape[1]))
     if bad:
         raise UserError(f"{bad} pixels are NaN, infinite or negative")
     harmonics, irradiance = summary(cells)
     if not harmonics[0].sum() > 0:
         raise UserError("the map is black: there is no light in it")
-    return Survey(cells, harmonics, irradiance)
+    return Survey(source.shape[:2], cells, harmonics, irradiance)
 
 
 def disc_radius(share: ArrayLike) -> Array:
@@ -241,7 +243,7 @@ def disc_radius(share: ArrayLike) -> Array:
     return np.arccos(np.clip(2 * np.asarray(share, float) - 1, 0, 1))
 
 
-def fine_enough(radiance: NDArray[np.float32], width: int = 64) -> NDArray[np.float32]:
+def fine_enough(radiance: NDArray[np.float32], width: int) -> NDArray[np.float32]:
     """The same map with its pixels split where it is smaller than `width`."""
     radiance = np.ascontiguousarray(radiance, np.float32)
     times = math.ceil(width / radiance.shape[1])
@@ -259,12 +261,16 @@ def _lattice(count: int) -> tuple[int, int]:
     return int(_ROWS * more), int(_COLUMNS * more)
 
 
-def _solid_angles(labels: NDArray[np.int32], count: int) -> Array:
+def _solid_angles(labels: NDArray[np.int32], shape: tuple[int, int], count: int) -> Array:
     """Of the lights' regions, (N,)."""
-    rows, columns = labels.shape
-    solid = -np.diff(np.sin(math.pi * (0.5 - np.arange(rows + 1) / rows)))
-    solid *= 2 * math.pi / columns
-    return np.bincount(labels.ravel(), np.repeat(solid, columns), count)
+    # the cells' borders are those of pixels
+    down, across = (
+        np.arange(cells + 1) * pixels // cells / pixels
+        for cells, pixels in zip(labels.shape, shape, strict=True)
+    )
+    band = -np.diff(np.sin(math.pi * (0.5 - down)))
+    solid = band[:, None] * np.diff(2 * math.pi * across)
+    return np.bincount(labels.ravel(), solid.ravel(), count)
 
 
 def _middles(labels: NDArray[np.int32], count: int) -> Array:

@@ -81,6 +81,22 @@ def read_radiance(path: str | os.PathLike[str]) -> Radiance:
     return Radiance(np.ascontiguousarray(rgb), valid, clipped, kept)
 
 
+def read_latlong(path: str | os.PathLike[str]) -> Radiance:
+    """As :func:`read_radiance`, a lat-long map.
+
+    Raises
+    ------
+    UserError
+        As there, and when the picture is not 2:1.
+
+    """
+    found = read_radiance(path)
+    width, height = found.size
+    if width != 2 * height:
+        raise UserError(f"{width}x{height} is no latlong map: it must be 2:1", file=path)
+    return found
+
+
 def latlong_attributes(kept: Mapping[str, Any], origin: Any = None) -> dict[str, Any]:
     """Attributes of a lat-long EXR; OpenImageIO writes `textureformat` as OpenEXR's envmap."""
     attributes: dict[str, Any] = {**kept, "textureformat": "LatLong Environment"}

@@ -245,6 +245,43 @@ def write_exr(
         _write(temporary, spec, pixels, path)
 
 
+def write_mipmapped_exr(
+    path: str | os.PathLike[str],
+    levels: Sequence[NDArray[np.float32]],
+    *,
+    attributes: Mapping[str, Any] | None = None,
+) -> None:
+    """As :func:`write_exr`, tiled, with mip `levels` (H, W, 3), each half the one before.
+
+    OpenEXR wants levels down to one pixel: averages of the last one follow it.
+    """
+    import OpenImageIO as oiio
+
+    levels = list(levels)
+    while max(levels[-1].shape[:2]) > 1:
+        last = levels[-1]
+        height, width = (max(1, n // 2) for n in last.shape[:2])
+        even = last[: height * (last.shape[0] // height), : width * (last.shape[1] // width)]
+        halves = even.reshape(height, -1, width, last.shape[1] // width, 3)
+        levels.append(halves.mean(axis=(1, 3)))
+    with atomic_output(path) as temporary:
+        target = oiio.ImageOutput.create(os.fspath(temporary))
+        if target is None:
+            raise UserError(f"cannot write: {_reason(oiio.geterror)}", file=path)
+        for i, level in enumerate(levels):
+            height, width = level.shape[:2]
+            spec = _exr_spec((width, height), ("R", "G", "B"), attributes)
+            spec.tile_width = spec.tile_height = 64
+            mode = "AppendMIPLevel" if i else "Create"
+            if not (
+                target.open(os.fspath(temporary), spec, mode)
+                and target.write_image(np.ascontiguousarray(level, np.float32))
+            ):
+                raise UserError(f"cannot write: {_reason(target.geterror)}", file=path)
+        if not target.close():
+            raise UserError(f"cannot write: {_reason(target.geterror)}", file=path)
+
+
 @contextmanager
 def exr_rows(
     path: str | os.PathLike[str],

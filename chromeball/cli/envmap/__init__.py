@@ -3,10 +3,12 @@
 from cyclopts import App
 
 from chromeball.cli.envmap.align import align
+from chromeball.cli.envmap.harmonics import harmonics
 from chromeball.cli.envmap.lights import lights
+from chromeball.cli.envmap.prefilter import prefilter
 from chromeball.cli.envmap.probe import probe
 from chromeball.cli.envmap.warp import warp
 
 app = App(name="envmap", help="The light around a point.")
-for _command in (warp, align, probe, lights):
+for _command in (warp, align, probe, lights, harmonics, prefilter):
     app.command(_command)

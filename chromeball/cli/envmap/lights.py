@@ -49,8 +49,8 @@ def lights(
 
     from chromeball.envmap.grid import grid_lights
     from chromeball.envmap.lights import variance_cut
-    from chromeball.envmap.mapping import LatLong, make_mapping
-    from chromeball.envmap.picture import read_radiance, tone_mapped, write_preview
+    from chromeball.envmap.mapping import LatLong
+    from chromeball.envmap.picture import read_latlong, tone_mapped, write_preview
     from chromeball.scene.record import Stage, write_json
 
     if not 1 <= count <= 65536:
@@ -59,12 +59,8 @@ def lights(
         raise UserError("--depth is for the variance cut: cells of a grid have no one place")
     if seed and method != "random":
         raise UserError("--seed is for --method random")
-    image = read_radiance(env)
+    image = read_latlong(env)
     radiance, size, kept = image.rgb, image.size, image.attributes
-    try:
-        make_mapping("latlong", size)
-    except UserError as error:
-        raise UserError(error.what, file=env) from error
     distance = _read_depth(depth, size) if depth is not None else None
     origin = kept.get("origin")
     if distance is not None and origin is None:
