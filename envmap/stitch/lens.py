@@ -228,3 +228,50 @@ def full_frame(model: str, size: tuple[int, int], pixels: float) -> CameraModel:
     limit = {"equisolid": 3.999, "orthographic": 1.999, "equidistant": 2 * math.pi}.get(model, 1e9)
     fov = fov_of_frame(model, min(diagonal, limit), 1.0)
     return CameraModel(model, np.array([pixels, *centre]), size, max_angle=fov / 2)
+
+
+def parse_lens(spec: str, size: tuple[int, int], focal35: float | None = None) -> tuple[CameraModel, bool]:
+    """The lens that a user names, and whether its focal length is a guess.
+
+    ``MODEL`` alone: of unknown focal length, `focal35` (mm on 36 x 24 mm) where metadata tell
+    it. ``pinhole:FOV`` across the picture, degrees; ``MODEL:FOV[:cx,cy,radius]`` a fisheye's
+    image circle; ``MODEL:10.5mm:23.6`` focal length and width of the sensor in mm.
+
+    Raises
+    ------
+    UserError
+        When it cannot be read.
+
+    """
+    from chromeball.envmap.mapping import parse_lens as parse_circle
+
+    model, _, rest = spec.partition(":")
+    first, _, second = rest.partition(":")
+    try:
+        if not rest:
+            return guessed(model, size, focal35), True
+        if first.endswith("mm"):
+            focal, frame = float(first[:-2]), float(second)
+            fov_of_frame(model, frame, focal)
+            return full_frame(model, size, focal / frame * size[0]), False
+        if model == "pinhole":
+            if second or not 0 < float(first) < 170:
+                raise ValueError
+            return CameraModel.pinhole(size, math.radians(float(first))), False
+    except ValueError as error:
+        raise UserError(
+            f"--lens {spec!r}: write MODEL, MODEL:FOV, MODEL:FOV:cx,cy,radius or "
+            "MODEL:10.5mm:23.6 (focal length and sensor width)"
+        ) from error
+    return parse_circle(spec, size), False
+
+
+def guessed(model: str, size: tuple[int, int], focal35: float | None = None) -> CameraModel:
+    """A lens to begin a search with: the metadata's, or a common one."""
+    diagonal = math.hypot(*size)
+    if focal35 is not None:
+        return full_frame(model, size, focal35 / FULL_FRAME_DIAGONAL * diagonal)
+    if model == "pinhole":
+        return full_frame(model, size, 28 / FULL_FRAME_DIAGONAL * diagonal)
+    share = {"equisolid": 2 * math.sqrt(2), "orthographic": 2.0, "stereographic": 4.0}
+    return full_frame(model, size, diagonal / share.get(model, math.pi))  # 180 degrees

@@ -347,16 +347,37 @@ def _blind_links(
     return links, camera, notes
 
 
-def _search_focal(
+def likeliest(
+    features: Sequence[Features], cameras: Sequence[CameraModel], seed: int = 1
+) -> CameraModel:
+    """The lens of `cameras`, and the focal length, that most matches agree with."""
+    rng = np.random.default_rng(seed)
+    few = [_subset(f, np.arange(min(len(f.pixels), BLIND))) for f in features]
+    matched: dict[tuple[int, int], NDArray[np.int64]] = {}
+    for i in range(len(few)):
+        for j in range(i + 1, min(i + 4, len(few))):  # neighbours in time are so in space
+            matched[i, j] = match(few[i], few[j])
+    best: tuple[int, CameraModel] | None = None
+    for camera in cameras:
+        lens, _ = refinable(camera)
+        votes = _votes(few, lens, matched, rng)
+        k = int(np.argmax(votes))
+        if best is None or votes[k] > best[0]:
+            best = votes[k], scaled_focal(lens, float(FOCALS[k]))
+    if best is None:
+        raise ValueError("no lens to choose from")
+    return best[1]
+
+
+def _votes(
     features: Sequence[Features],
     camera: CameraModel,
     matched: dict[tuple[int, int], NDArray[np.int64]],
     rng: np.random.Generator,
-) -> tuple[CameraModel, list[str]]:
-    """The focal length with which most matches of the best pairs agree on rotations."""
+) -> list[int]:
+    """How many matches of the best pairs agree on rotations, for each of `FOCALS`."""
     best = sorted(matched, key=lambda pair: -len(matched[pair]))[:10]
     votes: list[int] = []
-    tolerance = math.radians(0.6)
     for factor in FOCALS:
         lens = scaled_focal(camera, float(factor))
         total = 0
@@ -364,9 +385,21 @@ def _search_focal(
             found = matched[i, j][:300]
             a = lens.unproject(features[i].pixels[found[:, 0]])
             b = lens.unproject(features[j].pixels[found[:, 1]])
-            for _, agree in find_rotations(a, b, tolerance, rng, 1):
+            # in pixels: a short lens makes all angles large
+            for _, agree in find_rotations(a, b, 8 / pixel_focal(lens), rng, 1):
                 total += int(agree.sum())
         votes.append(total)
+    return votes
+
+
+def _search_focal(
+    features: Sequence[Features],
+    camera: CameraModel,
+    matched: dict[tuple[int, int], NDArray[np.int64]],
+    rng: np.random.Generator,
+) -> tuple[CameraModel, list[str]]:
+    """The focal length with which most matches of the best pairs agree on rotations."""
+    votes = _votes(features, camera, matched, rng)
     k = int(np.argmax(votes))
     if votes[k] < 1.15 * votes[int(np.argmin(np.abs(FOCALS - 1)))]:
         return camera, []

@@ -1,0 +1,240 @@
+"""Exposure of each frame and the lens's fall-off, from where frames see the same (seeds.md F1s).
+
+ln L_i(p) = ln L(p) + e_i + V(r), V(r) = a1 r^2 + ... + a4 r^8, r = 1 at the picture's or the rim of its circle; differences between frames rid of L(p) are linear in all
+unknowns (after Goldman 2010, with known responses). Weights follow local contrast, what moved
+or gleams is voted down. The mean of all e_i stays zero: the panorama keeps its exposure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chromeball.envmap.mapping import Radial, of_camera
+from chromeball.envmap.stitch.frames import Frame
+from chromeball.scene.camera import CameraModel
+
+type Array = NDArray[np.float64]
+
+#: Directions that frames are compared in, and the width of the pictures that are compared.
+DIRECTIONS, SMALL = 30_000, 320
+#: Prior standard deviations of e_i, of the c_k, and the relative noise of a sample.
+EXPOSURE, FALLOFF, NOISE = 1.0, 1.0, 0.002
+#: Terms of the fall-off.
+TERMS = 3
+LEAST = 30  # samples below which nothing is solved
+
+
+@dataclass(frozen=True)
+class Photometric:
+    """``exposure`` (N, 3): ln of what each frame is brighter than the panorama, per channel.
+
+    ``falloff`` (TERMS,): c1, c2, ... of 1 + c1 r^2 + c2 r^4 + ..., which `envmap probe` takes, too. ``exposure_sigma`` (N,) and ``falloff_sigma`` are
+    standard errors; ``scatter`` the robust relative scatter of overlaps before and after;
+    ``samples`` how many comparisons; ``applied``: what was found is more than its error.
+    """
+
+    exposure: Array
+    falloff: Array
+    exposure_sigma: Array
+    falloff_sigma: Array
+    scatter: tuple[float, float]
+    samples: int
+    applied: bool
+
+    def gain(self, frame: int, camera: CameraModel) -> NDArray[np.float32]:
+        """What the radiance of a frame is multiplied by, (H, W, 3)."""
+        width, height = camera.size
+        x, y = np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float))
+        r2 = radius2(camera, np.stack([x, y], axis=-1))
+        fall = _falloff(r2, self.falloff)[0]
+        return (np.exp(-self.exposure[frame]) / fall[..., None]).astype(np.float32)
+
+
+def unchanged(count: int) -> Photometric:
+    """Frames that are taken as they are."""
+    zero = np.zeros(TERMS)
+    return Photometric(
+        np.zeros((count, 3)), zero, np.zeros(count), zero, (0.0, 0.0), 0, applied=False
+    )
+
+
+def radius2(camera: CameraModel, pixels: Array) -> Array:
+    """r^2 of `pixels` (..., 2), 1 at the corner of the picture or the rim of its circle."""
+    mapping = of_camera(camera)
+    width, height = camera.size
+    middle = np.array([(width - 1) / 2, (height - 1) / 2])
+    reach = np.hypot(width, height) / 2
+    if isinstance(mapping, Radial):
+        middle = np.array(mapping.centre)
+        reach = min(reach, abs(mapping.focal[0]) * mapping.rim)
+    return np.minimum((((pixels - middle) / reach) ** 2).sum(axis=-1), 1.0)
+
+
+def solve(
+    frames: Sequence[Frame],
+    camera: CameraModel,
+    rotations: Array,
+    *,
+    white_balance: bool = False,
+    exposure: bool = True,
+    falloff: bool = True,
+) -> Photometric:
+    """Exposures and fall-off that make overlapping frames agree.
+
+    `rotations` (N, 3, 3) are world_from_camera. With `white_balance` the channels have
+    exposures of their own.
+    """
+    count = len(frames)
+    log, weight, r2 = _samples(frames, camera, rotations)
+    seen = weight > 0
+    first, second, where = [], [], []
+    for i in range(count):
+        for j in range(i + 1, count):
+            both = np.flatnonzero(seen[i] & seen[j])
+            first.append(np.full(len(both), i))
+            second.append(np.full(len(both), j))
+            where.append(both)
+    a, b, p = (np.concatenate(v) if v else np.zeros(0, np.intp) for v in (first, second, where))
+    if len(p) < LEAST or not (exposure or falloff):
+        return unchanged(count)
+    grey = log @ np.array([0.25, 0.5, 0.25])
+    ra, rb = r2[a, p], r2[b, p]
+    sigma2 = 1 / weight[a, p] + 1 / weight[b, p]
+    columns = count + TERMS
+    prior = np.r_[
+        np.full(count, 1 / EXPOSURE**2 if exposure else 1e12),
+        np.full(TERMS, 1 / FALLOFF**2 if falloff else 1e12),
+    ]
+
+    def normal(w: Array, y: Array, powers: Array) -> tuple[Array, Array]:
+        matrix = np.diag(prior)
+        right = np.zeros(columns)
+        pair = np.zeros((count, count))
+        np.add.at(pair, (a, b), w)
+        pair += pair.T
+        matrix[:count, :count] += np.diag(pair.sum(axis=1)) - pair
+        wp = w[:, None] * powers
+        for sign, index in ((1.0, a), (-1.0, b)):
+            cross = np.stack([np.bincount(index, wp[:, k], count) for k in range(TERMS)], axis=-1)
+            matrix[:count, count:] += sign * cross
+            matrix[count:, :count] += sign * cross.T
+            right[:count] += sign * np.bincount(index, w * y, count)
+        matrix[count:, count:] += wp.T @ powers
+        right[count:] = wp.T @ y
+        return matrix, right
+
+    def model(x: Array) -> tuple[Array, Array]:
+        """Differences that unknowns explain, and their slopes by the c_k."""
+        (va, sa), (vb, sb) = _falloff(ra, x[count:]), _falloff(rb, x[count:])
+        return x[a] - x[b] + np.log(va / vb), sa - sb
+
+    y = grey[a, p] - grey[b, p]
+    x, scale, matrix = np.zeros(columns), 0.0, np.eye(columns)
+    powers = np.zeros((len(p), TERMS))
+    for _ in range(30):
+        said, powers = model(x)
+        t = (y - said) / np.sqrt(sigma2)
+        scale = 1.4826 * float(np.median(np.abs(t)))
+        w = 1 / (1 + (t / max(2 * scale, 1e-9)) ** 2) ** 2 / sigma2
+        matrix, right = normal(w, y - said, powers)
+        step = np.linalg.solve(matrix, right - prior * x)
+        fall = x[count:] + step[count:]
+        # a fall-off that is not positive is a step too far
+        while _falloff(np.linspace(0, 1, 65), fall)[0].min() < 0.02:
+            step = step / 2
+            fall = x[count:] + step[count:]
+        x = x + step
+        if float(np.abs(step).max()) < 1e-9:
+            break
+    covariance = np.linalg.inv(matrix) * max(scale, 1e-9) ** 2
+    # exposures against their mean, which the frames leave open
+    mean = np.eye(columns)
+    mean[:count, :count] -= 1 / count
+    covariance = mean @ covariance @ mean.T
+    error = np.sqrt(np.maximum(np.diag(covariance), 0))
+    channels = np.repeat(x[:count, None], 3, axis=1)
+    if white_balance and exposure:
+        w = 1 / sigma2
+        for c in range(3):
+            off = log[a, p, c] - log[b, p, c] - model(x)[0]
+            spread = max(1.4826 * float(np.median(np.abs(off))), 1e-9)
+            matrix, right = normal(w / (1 + (off / spread / 2) ** 2) ** 2, off, powers)
+            channels[:, c] += np.linalg.solve(matrix[:count, :count], right[:count])
+    channels -= channels.mean(axis=0)
+    fitted = y - model(x)[0]
+    before = 1.4826 * float(np.median(np.abs(y)))
+    e, fall = x[:count] - x[:count].mean(), x[count:]
+    told = bool((np.abs(e) > 3 * error[:count]).any() or _tells(fall, covariance[count:, count:]))
+    told |= white_balance
+    return Photometric(
+        exposure=channels if told else np.zeros((count, 3)),
+        falloff=fall if told else np.zeros(TERMS),
+        exposure_sigma=error[:count],
+        falloff_sigma=error[count:],
+        scatter=(before, 1.4826 * float(np.median(np.abs(fitted)))),
+        samples=len(p),
+        applied=told,
+    )
+
+
+def _falloff(r2: Array, c: Array) -> tuple[Array, Array]:
+    """1 + c1 r^2 + c2 r^4 + ..., and the slopes of its logarithm by the c_k, (..., TERMS)."""
+    powers = np.stack([r2 ** (k + 1) for k in range(TERMS)], axis=-1)
+    value = 1 + powers @ c
+    return value, powers / value[..., None]
+
+
+def _tells(values: Array, covariance: Array) -> bool:
+    """Whether values are more than their errors: a chi-square over 25."""
+    return bool(values @ np.linalg.pinv(covariance) @ values > 25)
+
+
+def _samples(
+    frames: Sequence[Frame], camera: CameraModel, rotations: Array
+) -> tuple[Array, Array, Array]:
+    """Log radiance (N, P, 3), weights (N, P) and r^2 (N, P) in directions over the sphere."""
+    import cv2
+
+    k = np.arange(DIRECTIONS) + 0.5
+    z, turn = 1 - 2 * k / DIRECTIONS, k * np.pi * (1 + 5**0.5)  # Fibonacci's lattice
+    flat = np.sqrt(1 - z * z)
+    world = np.stack([flat * np.cos(turn), z, flat * np.sin(turn)], axis=-1)
+    mapping = of_camera(camera)
+    width, height = camera.size
+    step = max(1, round(max(width, height) / SMALL))
+    size = (max(1, width // step), max(1, height // step))
+    shape = (len(frames), DIRECTIONS)
+    log, weight, r2 = np.zeros((*shape, 3)), np.zeros(shape), np.zeros(shape)
+    circle = mapping.solid_angles() > 0
+    scale = np.array([size[0] / width, size[1] / height])
+    for i, frame in enumerate(frames):
+        # only what is seen whole, not clipped and not dark counts
+        usable = circle & (frame.radiance.min(axis=2) > 0)
+        if frame.valid is not None:
+            usable &= frame.valid
+        if frame.clipped is not None:
+            usable &= ~frame.clipped
+        whole = cv2.resize(usable.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+        small = cv2.resize(frame.radiance, size, interpolation=cv2.INTER_AREA)
+        floor = 0.02 * float(np.median(small[whole > 0.999])) if (whole > 0.999).any() else 0.0
+        small = np.log(np.maximum(small, max(floor, 1e-30)))
+        whole[small.min(axis=2) <= np.log(max(floor, 1e-30)) + 1e-6] = 0
+        grey = small.mean(axis=2)
+        contrast = np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1))
+        contrast = cv2.dilate(contrast / 8, np.ones((3, 3), np.uint8))
+        whole = cv2.erode(whole, np.ones((3, 3), np.uint8), borderValue=0.0)
+        q = mapping.turned(rotations[i]).pixels_of(world)
+        inside = np.isfinite(q).all(axis=1)
+        q = np.where(inside[:, None], q, -10.0)
+        at = ((q + 0.5) * scale - 0.5).astype(np.float32)[None]
+        maps = at[..., 0], at[..., 1]
+        log[i] = cv2.remap(small, *maps, cv2.INTER_LINEAR)[0]
+        noise = NOISE**2 + (0.2 * cv2.remap(contrast, *maps, cv2.INTER_LINEAR)[0]) ** 2
+        seen = cv2.remap(whole, *maps, cv2.INTER_LINEAR, borderValue=0.0)[0] > 0.999
+        weight[i] = np.where(seen & inside, 1 / noise, 0.0)
+        r2[i] = radius2(camera, q)
+    return log, weight, r2
