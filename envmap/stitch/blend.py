@@ -56,9 +56,8 @@ class Composite:
     """``radiance`` (H, W, 3) float32, black where no frame sees; ``alpha`` (H, W).
 
     ``labels`` (H, W) the frame of each pixel, -1 for none; ``energy_errors`` of each frame's
-    resampling; ``limited`` pixels whose blend was held between the frames', and ``limited_share``
-    what that changed of the energy; ``blend_energy`` what the bands changed of the energy,
-    relative.
+    resampling; ``limited`` pixels whose blend was held near the frames', ``limited_share`` what
+    that changed of the energy; ``blend_energy`` what the bands changed of it, relative.
     """
 
     radiance: Picture
@@ -152,9 +151,7 @@ def _blend(
         hot[at] += np.where(mask[..., None], patch.radiance - base, 0)
         pyramid.add(np.where(sees, base - ground[at], 0), mask.astype(np.float32), patch)
     blended = ground + pyramid.collapse()
-    bounded = np.clip(
-        blended, LIMITS[0] * np.where(np.isfinite(low), low, 0), LIMITS[1] * high
-    )
+    bounded = np.clip(blended, LIMITS[0] * np.where(np.isfinite(low), low, 0), LIMITS[1] * high)
     bounded[~seen] = 0
     solid = target.solid_angles()
     result = bounded + hot
@@ -252,10 +249,10 @@ def _patch(radiance: Picture, frame: Frame, source: Mapping, target: LatLong) ->
     left, across = 0, width
     if not columns.all():
         # the longest gap without coverage lies outside
-        empty = np.flatnonzero(np.r_[columns, columns])
-        gaps = np.diff(empty)
+        seen = np.flatnonzero(np.r_[columns, columns])
+        gaps = np.diff(seen)
         at = int(gaps.argmax())
-        left, across = int(empty[at + 1]) % width, width - int(gaps[at]) + 1
+        left, across = int(seen[at + 1]) % width, width - int(gaps[at]) + 1
     top, bottom = int(rows[0]), int(rows[-1]) + 1
     where = np.ix_(np.arange(top, bottom), (left + np.arange(across)) % width)
     return Patch(result.radiance[where], result.coverage[where], top, left, error)

@@ -1,4 +1,4 @@
-"""The finished panorama through the photograph's own lens, beside the photograph (seeds.md F2)."""
+"""The panorama through the photograph's own lens, beside the photograph (seeds.md F2)."""
 
 from __future__ import annotations
 
@@ -90,14 +90,22 @@ def outlines(
     x, y = np.linspace(0, w - 1, 4 * WIDTH), np.linspace(0, h - 1, 4 * WIDTH)
     zero, one = np.zeros_like(x), np.ones_like(x)
     border = np.concatenate(
-        [np.stack(p, -1) for p in ((x, zero), (x, one * (h - 1)), (zero, y), (one * (w - 1), y))]
+        [
+            np.stack(p, -1)
+            for p in ((x, zero), (x, one * (h - 1)), (zero, y), (one * (w - 1), y))
+        ]
     )
     d = camera.unproject(border)
     if not np.isfinite(d).all():  # the image circle is the border there
         turn = np.linspace(0, 2 * np.pi, 8 * WIDTH)
         reach = camera.max_angle * (1 - 1e-6)
         circle = np.stack(
-            [np.sin(reach) * np.cos(turn), np.sin(reach) * np.sin(turn), np.full_like(turn, np.cos(reach))], -1
+            [
+                np.sin(reach) * np.cos(turn),
+                np.sin(reach) * np.sin(turn),
+                np.full_like(turn, np.cos(reach)),
+            ],
+            -1,
         )
         q = camera.project(circle)
         with np.errstate(invalid="ignore"):

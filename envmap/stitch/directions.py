@@ -33,7 +33,11 @@ def world_from_angles(yaw: float, pitch: float, roll: float) -> Array:
 
 
 def from_angles(
-    yaw: Sequence[float], pitch: Sequence[float], roll: Sequence[float], sigma: float = SESSION
+    yaw: Sequence[float],
+    pitch: Sequence[float],
+    roll: Sequence[float],
+    *,
+    sigma: float = SESSION,
 ) -> Prior:
     """The session's angles, degrees, good to `sigma` degrees an axis."""
     turns = [world_from_angles(*a) for a in zip(yaw, pitch, roll, strict=True)]
@@ -65,10 +69,12 @@ def read_directions(
         value = read_json(path)
         if not isinstance(value, dict) or not isinstance(value.get("frames"), list):
             raise UserError('needs {"frames": [...]}, a list of directions', file=path)
-        rows = value["frames"]
+        rows = [row for row in value["frames"] if isinstance(row, dict)]
+        if len(rows) < len(value["frames"]):
+            raise UserError("each of the frames is a table", file=path)
         if sigma is None and "sigma_degrees" in value:
             default = _number(value["sigma_degrees"], "sigma_degrees", path)
-    named = [isinstance(row, dict) and bool(row.get("file")) for row in rows]
+    named = [bool(row.get("file")) for row in rows]
     if any(named) != all(named):
         raise UserError("either all directions name their file, or none does", file=path)
     if not any(named) and len(rows) != len(names):
@@ -78,8 +84,6 @@ def read_directions(
     turns = np.tile(np.eye(3), (len(names), 1, 1))
     spread = np.full(len(names), math.inf)
     for k, row in enumerate(rows):
-        if not isinstance(row, dict):
-            raise UserError(f"direction {k + 1} is no table", file=path)
         at = [k]
         if any(named):
             stem = Path(str(row["file"])).stem

@@ -57,7 +57,7 @@ def perceptual(
     weight = cv2.resize(seen.astype(np.float32), small, interpolation=cv2.INTER_AREA)
     base = cv2.resize(log, small, interpolation=cv2.INTER_AREA)  # times the weight already
     base = cv2.GaussianBlur(base, (0, 0), sigma / step)
-    base /= np.maximum(cv2.GaussianBlur(weight, (0, 0), sigma / step), 1e-6)
+    base = base / np.maximum(cv2.GaussianBlur(weight, (0, 0), sigma / step), 1e-6)
     base = cv2.resize(base, (y.shape[1], y.shape[0]), interpolation=cv2.INTER_LINEAR)
     flat = log - np.float32(FLATTEN) * base
     middle = np.median(flat[seen][:: max(1, int(seen.sum()) // 65536)])
@@ -69,7 +69,7 @@ def perceptual(
 def find(
     radiance: NDArray[np.float32], valid: NDArray[np.bool_] | None = None, limit: int = LIMIT
 ) -> Features:
-    """Features of (H, W, 3) radiance; where there are few (a clear sky), of faint contrast, too."""
+    """Features of (H, W, 3) radiance; where there are few (a clear sky), faint ones, too."""
     found = detect(perceptual(radiance, valid), valid, limit)
     if len(found.pixels) < FEW:
         faint = detect(perceptual(radiance, valid, 6 * CONTRAST), valid, limit)
@@ -84,7 +84,7 @@ def detect(
     import cv2
 
     # without the precise upscale all places are 0.25 px off
-    sift = cv2.SIFT_create(nfeatures=limit, contrastThreshold=0.02, enable_precise_upscale=True)
+    sift = cv2.SIFT.create(nfeatures=limit, contrastThreshold=0.02, enable_precise_upscale=True)
     mask = None
     if valid is not None:
         inner = np.pad(valid, 1).astype(np.uint8)
@@ -99,7 +99,9 @@ def detect(
     # a place with two orientations counts twice; that is right for matching
     pixels = np.array([p.pt for p in points], float)
     scale = np.array([p.size for p in points], float) / 2
-    root = np.sqrt(np.maximum(descriptors, 0) / np.maximum(descriptors.sum(1, keepdims=True), 1e-9))
+    root = np.sqrt(
+        np.maximum(descriptors, 0) / np.maximum(descriptors.sum(1, keepdims=True), 1e-9)
+    )
     return Features(pixels, scale, np.ascontiguousarray(root, np.float32), size)
 
 
@@ -146,6 +148,8 @@ def match(
     i = i[distance < ratio * other]
     found = np.stack([i, best[i]], axis=1)
     # one match a place
-    places = np.round(np.concatenate([first.pixels[found[:, 0]], second.pixels[found[:, 1]]], 1), 1)
+    places = np.round(
+        np.concatenate([first.pixels[found[:, 0]], second.pixels[found[:, 1]]], 1), 1
+    )
     _, kept = np.unique(places, axis=0, return_index=True)
     return found[np.sort(kept)]

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from chromeball.envmap.stitch.pairs import Link
+from chromeball.envmap.stitch.pairs import Link, nearest
 from chromeball.envmap.stitch.rotations import angle_between, exp, log
 
 type Array = NDArray[np.float64]
@@ -68,13 +68,11 @@ def spread(
     order = sorted(range(len(links)), key=lambda k: -(1 + loops[k]) * len(links[k].matches))
     rotations = np.tile(np.eye(3), (count, 1, 1))
     member = list(range(count))
-    tree: set[int] = set()
     for k in order:  # Kruskal's tree of the most trusted; groups turn as they join
         link = links[k]
         a, b = member[link.first], member[link.second]
         if a == b:
             continue
-        tree.add(k)
         turn = rotations[link.first] @ link.rotation @ rotations[link.second].T
         for frame in [f for f in range(count) if member[f] == b]:
             rotations[frame] = turn @ rotations[frame]
@@ -126,8 +124,7 @@ def to_prior(
     near = off < 4 * np.sqrt(widths[:, None] ** 2 + widths[None, :] ** 2)
     # ties go to the one nearest to all
     best = min(range(len(have)), key=lambda k: (-int(near[k].sum()), float(off[k].sum())))
-    u, _, vt = np.linalg.svd(turns[near[best]].sum(axis=0))
-    turn = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    turn = nearest(turns[near[best]].sum(axis=0))
     return turn, [have[k] for k in np.flatnonzero(near[best])]
 
 
@@ -139,7 +136,7 @@ def level(rotations: Array) -> Array:
     """
     best: tuple[float, Array] | None = None
     for axis in (0, 1):
-        values, vectors = np.linalg.eigh(np.einsum("na,nb->ab", *[rotations[:, :, axis]] * 2))
+        values, vectors = np.linalg.eigh(rotations[:, :, axis].T @ rotations[:, :, axis])
         # two small values: all frames face one way, and up is the mean of theirs
         certain = values[1] > 4 * values[0] + 1e-6 * len(rotations)
         if certain and (best is None or values[0] < best[0]):
@@ -153,4 +150,4 @@ def level(rotations: Array) -> Array:
     if np.linalg.norm(ahead) < 1e-3:  # the first frame looks straight up or down
         ahead = -rotations[0][:, 1] - (-rotations[0][:, 1] @ up) * up
     ahead = ahead / np.linalg.norm(ahead)
-    return np.stack([np.cross(up, ahead), up, ahead])
+    return np.asarray(np.stack([np.cross(up, ahead), up, ahead]), float)

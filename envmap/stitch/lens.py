@@ -84,8 +84,9 @@ def refinable(camera: CameraModel) -> tuple[CameraModel, float]:
     if pinhole:
         theta_max = min(math.atan(reach), math.radians(75))
     else:
-        line = camera.unproject(np.stack([cx + fx * np.linspace(0, reach, 512),
-                                          np.full(512, cy)], axis=-1))
+        line = camera.unproject(
+            np.stack([cx + fx * np.linspace(0, reach, 512), np.full(512, cy)], axis=-1)
+        )
         angles = np.arctan2(np.hypot(line[:, 0], line[:, 1]), line[:, 2])
         theta_max = min(theta_max, float(np.nanmax(angles)) + 1e-9)
     theta = np.linspace(0, theta_max, 257)[1:]
@@ -165,8 +166,12 @@ def rays(camera: CameraModel, freedom: Freedom, pixels: Array) -> tuple[Array, A
         columns += [along * (-(theta**p) / slope)[:, None] for p in (3, 5)]
     if freedom.centre:
         turn = np.where(r > 1e-12, np.sin(theta) / safe, 1.0)
-        columns.append(-(along * (cosine / slope)[:, None] - across * (sine * turn)[:, None]) / fx)
-        columns.append(-(along * (sine / slope)[:, None] + across * (cosine * turn)[:, None]) / fy)
+        columns.append(
+            -(along * (cosine / slope)[:, None] - across * (sine * turn)[:, None]) / fx
+        )
+        columns.append(
+            -(along * (sine / slope)[:, None] + across * (cosine * turn)[:, None]) / fy
+        )
     return d, np.stack(columns, axis=-1)
 
 
@@ -195,21 +200,30 @@ def fov_of_frame(model: str, frame: float, focal: float) -> float:
 
     """
     share = frame / (2 * focal)
-    limits = {"pinhole": math.inf, "equidistant": math.pi, "equisolid": 2.0,
-              "stereographic": math.inf, "orthographic": 1.0}
+    limits = {
+        "pinhole": math.inf,
+        "equidistant": math.pi,
+        "equisolid": 2.0,
+        "stereographic": math.inf,
+        "orthographic": 1.0,
+    }
     if model not in limits:
         raise UserError(f"unknown lens {model!r}; one of {', '.join(limits)}")
     if not 0 < share <= limits[model]:
         raise UserError(
             f"no {model} lens of {focal:g} mm fills {frame:g} mm: check focal length and frame"
         )
-    return {
-        "pinhole": lambda s: 2 * math.atan(s),
-        "equidistant": lambda s: 2 * s,
-        "equisolid": lambda s: 4 * math.asin(s / 2),
-        "stereographic": lambda s: 4 * math.atan(s / 2),
-        "orthographic": lambda s: 2 * math.asin(s),
-    }[model](share)
+    match model:
+        case "pinhole":
+            return 2 * math.atan(share)
+        case "equidistant":
+            return 2 * share
+        case "equisolid":
+            return 4 * math.asin(share / 2)
+        case "stereographic":
+            return 4 * math.atan(share / 2)
+        case _:
+            return 2 * math.asin(share)
 
 
 def full_frame(model: str, size: tuple[int, int], pixels: float) -> CameraModel:
@@ -225,12 +239,16 @@ def full_frame(model: str, size: tuple[int, int], pixels: float) -> CameraModel:
     if model == "pinhole":
         return CameraModel("pinhole", np.array([pixels, pixels, *centre]), size)
     diagonal = math.hypot(*size) / pixels
-    limit = {"equisolid": 3.999, "orthographic": 1.999, "equidistant": 2 * math.pi}.get(model, 1e9)
+    limit = {"equisolid": 3.999, "orthographic": 1.999, "equidistant": 2 * math.pi}.get(
+        model, 1e9
+    )
     fov = fov_of_frame(model, min(diagonal, limit), 1.0)
     return CameraModel(model, np.array([pixels, *centre]), size, max_angle=fov / 2)
 
 
-def parse_lens(spec: str, size: tuple[int, int], focal35: float | None = None) -> tuple[CameraModel, bool]:
+def parse_lens(
+    spec: str, size: tuple[int, int], focal35: float | None = None
+) -> tuple[CameraModel, bool]:
     """The lens that a user names, and whether its focal length is a guess.
 
     ``MODEL`` alone: of unknown focal length, `focal35` (mm on 36 x 24 mm) where metadata tell

@@ -19,12 +19,11 @@ from chromeball.envmap.stitch.lens import (
     KNOWN,
     Freedom,
     pixel_focal,
-    rays,
     refinable,
     scaled_focal,
 )
 from chromeball.envmap.stitch.pairs import LEAST, Link, believable, find_rotations
-from chromeball.envmap.stitch.rotations import Adjusted, Matches, adjust
+from chromeball.envmap.stitch.rotations import Adjusted, Matches, adjust, log
 from chromeball.scene.camera import CameraModel
 from chromeball.scene.errors import UserError
 
@@ -110,9 +109,11 @@ def orient(
     if prior is not None:
         say("matching where the tracker says that frames overlap")
         links = _tracked_links(features, camera, prior, freedom, rng)
-    blind = [
-        k for group in groups(count, _pairs_of(links))[1:] for k in group
-    ] if links else list(range(count))
+    blind = (
+        [k for group in groups(count, _pairs_of(links))[1:] for k in group]
+        if links
+        else list(range(count))
+    )
     if blind and count > 1:
         say(f"matching {len(blind)} frames with all others")
         found, camera, searched = _blind_links(features, camera, blind, freedom, rng)
@@ -152,7 +153,9 @@ def orient(
     doubted = _doubted(adjusted, prior, parts, names, notes)
     if len(parts) > 1:
         alone = ["+".join(names[k] for k in part) for part in parts[1:]]
-        notes.append(f"placed by the tracker alone, no picture connects them: {', '.join(alone)}")
+        notes.append(
+            f"placed by the tracker alone, no picture connects them: {', '.join(alone)}"
+        )
     wrong = sorted({(ln.first, ln.second) for ln in refused} - set(linked))
     if wrong:
         listed = ", ".join(f"{names[i]}-{names[j]}" for i, j in wrong[:6])
@@ -448,7 +451,9 @@ def _matches(features: Sequence[Features], links: Sequence[Link]) -> Matches:
         empty = np.zeros((0, 2))
         return Matches(np.zeros((0, 2), np.int64), empty, empty, np.zeros(0))
     return Matches(
-        np.concatenate(frames), np.concatenate(first), np.concatenate(second),
+        np.concatenate(frames),
+        np.concatenate(first),
+        np.concatenate(second),
         np.concatenate(sigma),
     )
 
@@ -555,15 +560,20 @@ def _doubted(
         listed = ", ".join(f"{names[k]} by {math.degrees(off[k]):.1f}" for k in doubted)
         notes.append(f"the tracker is wrong in these frames, degrees: {listed}")
     fine = [k for k in range(len(off)) if np.isfinite(off[k]) and k not in doubted]
-    if len(fine) >= 4:
-        rms = math.sqrt(float(np.mean(off[fine] ** 2)) / 3)
-        given = math.sqrt(float(np.mean(sigma[fine] ** 2)))
-        if rms > 2 * given:
-            notes.append(
-                f"the tracker scatters by {math.degrees(rms):.2f} degree an axis, not "
-                f"{math.degrees(given):.2f}"
-            )
-        drift = np.polyfit(np.arange(len(fine)), np.degrees(off[fine]), 1)[0] * len(fine)
-        if drift > 4 * math.degrees(given) and rms > given:
-            notes.append(f"the tracker drifts: {drift:.1f} degrees from first to last frame")
+    if len(fine) < 4:
+        return doubted
+    rms = math.sqrt(float(np.mean(off[fine] ** 2)) / 3)
+    given = math.sqrt(float(np.mean(sigma[fine] ** 2)))
+    turned = log(adjusted.rotations[fine] @ np.swapaxes(prior.rotations[fine], 1, 2))
+    slope = np.polyfit(np.array(fine, float), turned, 1)[0]
+    drift = float(np.linalg.norm(slope)) * (fine[-1] - fine[0])
+    if drift > 4 * given * math.sqrt(12 / len(fine)):
+        notes.append(
+            f"the tracker drifts by {math.degrees(drift):.1f} degrees from first to last frame"
+        )
+    elif rms > 1.5 * given:  # 1 in 1000 for 7 frames
+        notes.append(
+            f"the tracker scatters by {math.degrees(rms):.2f} degree an axis, not "
+            f"{math.degrees(given):.2f}"
+        )
     return doubted

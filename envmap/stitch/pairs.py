@@ -38,8 +38,13 @@ class Link:
 def wahba(first: Array, second: Array, weights: Array | None = None) -> Array:
     """R (3, 3) that minimises sum w |first - R second|^2 (Wahba 1965, by SVD)."""
     w = np.ones(len(first)) if weights is None else weights
-    u, _, vt = np.linalg.svd((first * w[:, None]).T @ second)
-    return u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    return nearest((first * w[:, None]).T @ second)
+
+
+def nearest(matrix: Array) -> Array:
+    """The rotation nearest to a (3, 3) matrix."""
+    u, _, vt = np.linalg.svd(matrix)
+    return np.asarray(u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt, float)
 
 
 def find_rotations(

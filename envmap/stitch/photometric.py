@@ -1,8 +1,9 @@
-"""Exposure of each frame and the lens's fall-off, from where frames see the same (seeds.md F1s).
+"""Exposure of each frame and the lens's fall-off, from where frames overlap (seeds.md F1s).
 
-ln L_i(p) = ln L(p) + e_i + V(r), V(r) = a1 r^2 + ... + a4 r^8, r = 1 at the picture's or the rim of its circle; differences between frames rid of L(p) are linear in all
-unknowns (after Goldman 2010, with known responses). Weights follow local contrast, what moved
-or gleams is voted down. The mean of all e_i stays zero: the panorama keeps its exposure.
+ln L_i(p) = ln L(p) + e_i + ln(1 + c1 r^2 + c2 r^4 + c3 r^6), r = 1 at the picture's corner or
+the rim of its circle; differences between frames are rid of L(p) (after Goldman 2010, with
+known responses). Gauss-Newton. Weights follow local contrast, what moved or gleams is voted
+down. The mean of all e_i stays zero: the panorama keeps its exposure.
 """
 
 from __future__ import annotations
@@ -32,9 +33,10 @@ LEAST = 30  # samples below which nothing is solved
 class Photometric:
     """``exposure`` (N, 3): ln of what each frame is brighter than the panorama, per channel.
 
-    ``falloff`` (TERMS,): c1, c2, ... of 1 + c1 r^2 + c2 r^4 + ..., which `envmap probe` takes, too. ``exposure_sigma`` (N,) and ``falloff_sigma`` are
-    standard errors; ``scatter`` the robust relative scatter of overlaps before and after;
-    ``samples`` how many comparisons; ``applied``: what was found is more than its error.
+    ``falloff`` (TERMS,): c1, c2, ... of 1 + c1 r^2 + c2 r^4 + ..., as `envmap probe` takes it.
+    ``exposure_sigma`` (N,) and ``falloff_sigma`` are standard errors; ``scatter`` the robust
+    relative scatter of overlaps before and after; ``samples`` how many comparisons;
+    ``applied``: what was found is more than its error.
     """
 
     exposure: Array
@@ -119,7 +121,9 @@ def solve(
         matrix[:count, :count] += np.diag(pair.sum(axis=1)) - pair
         wp = w[:, None] * powers
         for sign, index in ((1.0, a), (-1.0, b)):
-            cross = np.stack([np.bincount(index, wp[:, k], count) for k in range(TERMS)], axis=-1)
+            cross = np.stack(
+                [np.bincount(index, wp[:, k], count) for k in range(TERMS)], axis=-1
+            )
             matrix[:count, count:] += sign * cross
             matrix[count:, :count] += sign * cross.T
             right[:count] += sign * np.bincount(index, w * y, count)
@@ -168,7 +172,9 @@ def solve(
     fitted = y - model(x)[0]
     before = 1.4826 * float(np.median(np.abs(y)))
     e, fall = x[:count] - x[:count].mean(), x[count:]
-    told = bool((np.abs(e) > 3 * error[:count]).any() or _tells(fall, covariance[count:, count:]))
+    told = bool(
+        (np.abs(e) > 3 * error[:count]).any() or _tells(fall, covariance[count:, count:])
+    )
     told |= white_balance
     return Photometric(
         exposure=channels if told else np.zeros((count, 3)),
@@ -224,7 +230,9 @@ def _samples(
         small = np.log(np.maximum(small, max(floor, 1e-30)))
         whole[small.min(axis=2) <= np.log(max(floor, 1e-30)) + 1e-6] = 0
         grey = small.mean(axis=2)
-        contrast = np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1))
+        contrast = np.hypot(
+            cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1)
+        )
         contrast = cv2.dilate(contrast / 8, np.ones((3, 3), np.uint8))
         whole = cv2.erode(whole, np.ones((3, 3), np.uint8), borderValue=0.0)
         q = mapping.turned(rotations[i]).pixels_of(world)

@@ -30,9 +30,9 @@ type Array = NDArray[np.float64]
 
 #: The scatter of good features in pixels; robust scales go no lower.
 FEATURE = 0.3
-#: The robust scale in medians of the residuals, and how many scales away a match still counts:
-#: the better half of the matches where frames disagree (parallax), nearly all where they agree.
-HALF = 0.4
+#: The robust scale in medians of the residuals where their tail is long (the 80th percentile
+#: over the median; 1.52 for noise): the better half counts. REACH: scales at which a match ends.
+HALF, TAIL = 0.4, 1.75
 REACH = 2.5
 ITERATIONS = 50
 #: Steps below it end the iteration, radians.
@@ -104,7 +104,7 @@ def angle_between(a: Array, b: Array) -> Array:
     """Angles between rotations, radians, (..., 3, 3) -> (...)."""
     # |A - B|^2 = 8 sin^2(t / 2): exact for small angles, where the trace cancels
     half = np.linalg.norm(a - b, axis=(-2, -1)) / math.sqrt(8)
-    return 2 * np.arcsin(np.clip(half, 0, 1))
+    return np.asarray(2 * np.arcsin(np.clip(half, 0, 1)))
 
 
 def adjust(
@@ -136,12 +136,12 @@ def adjust(
     problem = _Problem(matches, freedom, camera)
     damping, scale, iteration = 1e-9, math.inf, 0
     e, jacobian = problem.residuals(rotations, lens)
-    for iteration in range(1, ITERATIONS + 1):
+    for iteration in range(1, ITERATIONS + 1):  # noqa: B007
         norm = np.linalg.norm(e, axis=1)
         # from all matches to the half that agrees best, step by step
-        middle = float(np.median(norm))
-        floor = max(HALF * middle, FEATURE)
-        scale = min(max(0.8 * scale, floor), max(middle, FEATURE))
+        middle, most = np.percentile(norm, [50, 80])
+        floor = max((HALF if most > TAIL * middle else 1.0) * float(middle), FEATURE)
+        scale = min(max(0.8 * scale, floor), max(float(middle), FEATURE))
         weight = 1 / (1 + (norm / (2 * scale)) ** 2) ** 2 / scale**2
         hessian, gradient = problem.normal(e, jacobian, weight, count)
         if freedom.count:
@@ -166,9 +166,8 @@ def adjust(
         e, jacobian = tried
         if float(np.abs(step[:size]).max()) < SETTLED and scale <= 1.01 * floor:
             break
-    alive = np.linalg.norm(e, axis=1) < REACH * scale
     return _summary(
-        problem, rotations, lens, alive, prior, known, iteration, freedom, lens_prior
+        problem, rotations, lens, scale, prior, known, iteration, freedom, lens_prior
     )
 
 
@@ -277,7 +276,7 @@ def _summary(
     problem: _Problem,
     rotations: Array,
     lens: CameraModel,
-    alive: NDArray[np.bool_],
+    scale: float,
     prior: Array | None,
     known: NDArray[np.bool_],
     iterations: int,
@@ -286,28 +285,36 @@ def _summary(
 ) -> Adjusted:
     count, size = len(rotations), 3 * len(rotations)
     e, jacobian = problem.residuals(rotations, lens)
-    # two of three components are free, and each match takes its share of the unknowns
-    left = max(2 * int(alive.sum()) - size - freedom.count + 3, 1)
-    variance = float((e[alive] ** 2).sum()) / left
-    weight = alive / max(variance, 1e-12)
+    norm = np.linalg.norm(e, axis=1)
+    alive = norm < REACH * scale
+    # the sandwich A^-1 B A^-1 (Huber 1967): true whatever the residuals' distribution is
+    q = (norm / (2 * scale)) ** 2
+    weight = 1 / (1 + q) ** 2
+    bent = np.einsum("mka,mk->ma", jacobian, e)[:, None]  # J' e as a row
     hessian, _ = problem.normal(e, jacobian, weight, count)
+    curved, _ = problem.normal(e[:, :1], bent, (1 + q) ** -3 / scale**2, count)
+    middle, _ = problem.normal(e[:, :1], bent, weight**2, count)
+    if float(np.linalg.eigvalsh(hessian - curved)[3:].min(initial=1.0)) > 0:
+        hessian = hessian - curved
     if freedom.count:
-        hessian[size:, size:] += np.diag(1 / lens_prior**2)
+        hessian[size:, size:] += np.diag(float(np.mean(weight * norm**2)) / 2 / lens_prior**2)
     # free network: errors against the mean of all rotations, which the matches leave open
     gauge = np.zeros((size + freedom.count, 3))
     gauge[:size] = np.tile(np.eye(3), (count, 1))
     unit = 1 / np.sqrt(np.maximum(np.diag(hessian), 1e-300))
     scaled = hessian * unit[:, None] * unit[None, :]
     values, vectors = np.linalg.eigh(scaled)
-    kept = values > 1e-12 * values[-1]
+    kept = values > 1e-10 * values[-1]
     kept[:3] = False  # the gauge
     positive = values[3:]
     condition = float(positive[-1] / max(positive[0], 1e-300)) if len(positive) else math.inf
     inverse = (vectors[:, kept] / values[kept]) @ vectors[:, kept].T
-    covariance = inverse * unit[:, None] * unit[None, :]
+    inverse = inverse * unit[:, None] * unit[None, :]
+    covariance = inverse @ middle @ inverse
     project = np.eye(len(gauge)) - gauge @ np.linalg.pinv(gauge)
     covariance = project @ covariance @ project.T
     spread = np.sqrt(np.maximum(np.diag(covariance), 0))
+    linked = np.bincount(problem.frames[alive].ravel(), minlength=count) > 0
     off = np.full(count, np.nan)
     if prior is not None:
         off[known] = angle_between(rotations[known], prior[known])
@@ -318,10 +325,9 @@ def _summary(
         camera=lens,
         inliers=inliers,
         residuals=problem.pixels_off(rotations, lens),
-        sigma=spread[:size].reshape(-1, 3).max(axis=1),
+        sigma=np.where(linked, spread[:size].reshape(-1, 3).max(axis=1), math.inf),
         lens_sigma=spread[size:],
         condition=condition,
         prior_residual=off,
         iterations=iterations,
     )
-

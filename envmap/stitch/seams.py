@@ -106,16 +106,20 @@ def find_seams(
             quality = np.where(able, worth[:, grown].mean(axis=1), -1.0)
             if mask is bad and count > 2:
                 quality = quality * (0.1 + _agreement(radiance, seen, grown))
-            labels[grown] = int(quality.argmax())
+            chosen = int(quality.argmax())
+            taken = moved[grown]
+            if taken.any():  # a bright thing that moved is one thing
+                of_it = int(labels[grown][taken > 0][0])
+                chosen = of_it if able[of_it] else chosen
+                grown |= np.isin(moved, taken[taken > 0])
+            labels[grown] = chosen
             moved[grown] = places = places + 1
             if mask is bad:
                 area += float(solid[place].sum())
     return Seams(labels, weights, moved, places, torn, area)
 
 
-def _disagreement(
-    radiance: NDArray[np.float32], seen: NDArray[np.bool_]
-) -> NDArray[np.uint8]:
+def _disagreement(radiance: NDArray[np.float32], seen: NDArray[np.bool_]) -> NDArray[np.uint8]:
     """Where frames differ by more than contrast explains, (h, w) of 0 and 1."""
     import cv2
 
@@ -137,7 +141,9 @@ def _disagreement(
         beyond = several & (top - low > MOVED + 0.7 * rough)
     mask = beyond.astype(np.uint8)
     # specks are misplaced edges; what moved has a body
-    mask = _wrapped(mask, lambda m: cv2.morphologyEx(m, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8)))
+    mask = _wrapped(
+        mask, lambda m: cv2.morphologyEx(m, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
+    )
     return _wrapped(mask, lambda m: cv2.morphologyEx(m, cv2.MORPH_CLOSE, _disc(2)))
 
 
@@ -149,7 +155,9 @@ def _agreement(
     sees = seen[:, place]
     grey[~sees] = np.nan
     usual = np.nanmedian(np.where(sees.any(axis=0), grey, 0.0), axis=0)
-    off = np.where(sees, np.abs(grey - usual), 0.0).sum(axis=1) / np.maximum(sees.sum(axis=1), 1)
+    off = np.where(sees, np.abs(grey - usual), 0.0).sum(axis=1) / np.maximum(
+        sees.sum(axis=1), 1
+    )
     return np.where(sees.any(axis=1), 1 / (1 + (off / MOVED) ** 2), 0.0)
 
 
@@ -157,12 +165,13 @@ def _regions(mask: NDArray[np.uint8]) -> tuple[int, NDArray[np.int32], NDArray[n
     """Connected places of a map that wraps, their number + 1, and their sizes in pixels."""
     import cv2
 
-    number, regions = cv2.connectedComponents(mask, connectivity=8)
+    number, found = cv2.connectedComponents(mask, connectivity=8)
+    regions = np.asarray(found, np.int32)
     for y in range(len(regions)):
         a, b = int(regions[y, 0]), int(regions[y, -1])
         if a and b and a != b:
             regions[regions == b] = a
-    return number, regions, np.bincount(regions.ravel(), minlength=number)
+    return number, regions, np.bincount(regions.ravel(), minlength=number).astype(np.int64)
 
 
 def _wrapped(mask: NDArray[np.uint8], what: Callable[[Any], Any]) -> NDArray[np.uint8]:

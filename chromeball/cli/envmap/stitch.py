@@ -6,9 +6,7 @@ import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
-
-from cyclopts import Parameter
+from typing import TYPE_CHECKING, Any, Literal
 
 from chromeball.cli.envmap.arguments import (
     Json,
@@ -121,7 +119,7 @@ def stitch(
             parse_numbers(a, f"--{n}", count) if a is not None else [0.0] * count
             for a, n in zip(angles, ("yaw", "pitch", "roll"), strict=True)
         ]
-        prior = from_angles(*three, SESSION if sigma is None else sigma)
+        prior = from_angles(*three, sigma=SESSION if sigma is None else sigma)
     run(
         frames,
         camera=camera,

@@ -1,0 +1,375 @@
+"""Frames to one panorama: where they looked, exposures, seams, bands; what is refused."""
+
+from __future__ import annotations
+
+import json
+import math
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from chromeball.cli.main import build_app
+from chromeball.envmap.mapping import LatLong, of_camera
+from chromeball.envmap.probe import rotation
+from chromeball.envmap.stitch.blend import compose
+from chromeball.envmap.stitch.features import Features, find
+from chromeball.envmap.stitch.frames import Frame
+from chromeball.envmap.stitch.lens import Freedom, fov_of_frame, full_frame, parse_lens
+from chromeball.envmap.stitch.orient import Oriented, Prior, orient
+from chromeball.envmap.stitch.photometric import radius2, solve, unchanged
+from chromeball.envmap.stitch.rotations import Matches, adjust, angle_between, exp
+from chromeball.scene.camera import WORLD_FROM_LATLONG, CameraModel
+from chromeball.scene.errors import UserError
+from chromeball.scene.image import read_image, write_exr
+from chromeball.scene.record import read_json
+
+type Array = NDArray[np.float64]
+
+SIZE = (300, 200)
+LENS = full_frame("equisolid", SIZE, 10.5 / 23.6 * SIZE[0])
+BASE = WORLD_FROM_LATLONG.rotation
+SIGMA = math.radians(0.7)
+
+
+def world(d: Array) -> NDArray[np.float32]:
+    """A world of smooth blots, lat-long features of a few degrees, the same from anywhere."""
+    rng = np.random.default_rng(5)
+    d = np.nan_to_num(d)
+    total = np.zeros(d.shape[:-1])
+    waves = rng.normal(size=(60, 3)) * rng.uniform(6, 28, (60, 1))
+    for k, wave in enumerate(waves):
+        total += np.sin(d @ wave + k)
+    level = np.exp(total / 10)
+    tint = 1 + 0.2 * np.stack([d[..., 0], d[..., 1], -d[..., 0]], axis=-1)
+    return (level[..., None] * tint).astype(np.float32)
+
+
+def turns() -> Array:
+    """Six around, held upright, and one up: as a photographer would."""
+    rng = np.random.default_rng(3)
+    around = [(60 * k, -5.0, 90.0) for k in range(6)] + [(10.0, 80.0, 0.0)]
+    noisy = np.radians(np.array(around) + rng.normal(size=(7, 3)))
+    return np.array([rotation(*a) @ BASE for a in noisy])
+
+
+@cache
+def pictures() -> tuple[NDArray[np.float32], ...]:
+    mapping = of_camera(LENS)
+    return tuple(world(mapping.turned(r).directions()) for r in turns())
+
+
+@cache
+def features() -> tuple[Features, ...]:
+    return tuple(find(picture) for picture in pictures())
+
+
+def tracker(noise: float = SIGMA) -> Prior:
+    rng = np.random.default_rng(8)
+    off = exp(rng.normal(size=(7, 3)) * noise)
+    return Prior(off @ turns(), np.full(7, SIGMA))
+
+
+def misplaced(found: Array, true: Array) -> float:
+    """RMS angle in degrees, the common turn left out."""
+    u, _, vt = np.linalg.svd(np.einsum("nab,ncb->ac", true, found))
+    off = angle_between((u @ vt) @ found, true)
+    return math.degrees(math.sqrt(float(np.mean(off**2))))
+
+
+def solved(**options: object) -> Oriented:
+    return orient(features(), LENS, **options)  # type: ignore[arg-type]
+
+
+# ---- rotations
+
+
+@pytest.mark.parametrize("tracked", [True, False])
+def test_frames_are_found_to_a_hundredth_of_a_degree(tracked: bool) -> None:
+    found = solved(prior=tracker()) if tracked else solved()
+    # a pixel is .43 degree here
+    assert misplaced(found.rotations, turns()) < 0.05
+    assert len(found.groups) == 1
+    assert np.degrees(found.adjusted.sigma).max() < 0.05
+    assert found.adjusted.condition < 1e6
+    if not tracked:  # upright, the first frame ahead
+        assert abs((found.rotations[0] @ [0, 0, 1.0])[0]) < 1e-9
+        up = turns()[6] @ [0, 0, 1.0]
+        assert (found.rotations[6] @ [0, 0, 1.0]) @ [0, 1.0, 0] == pytest.approx(
+            up[1], abs=0.03
+        )
+
+
+def test_standard_errors_are_those_of_many_trials() -> None:
+    rng = np.random.default_rng(2)
+    true = turns()
+    camera = of_camera(LENS)
+    pairs, first, second = [], [], []
+    d = rng.normal(size=(6000, 3))
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    seen = [camera.turned(r).pixels_of(d) for r in true]
+    inside = [
+        np.isfinite(q).all(axis=1) & (q > 0).all(axis=1) & (q < np.array(SIZE) - 1).all(axis=1)
+        for q in seen
+    ]
+    for i in range(7):
+        for j in range(i + 1, 7):
+            both = np.flatnonzero(inside[i] & inside[j])[:60]
+            pairs += [[i, j]] * len(both)
+            first.append(seen[i][both])
+            second.append(seen[j][both])
+    a, b = np.concatenate(first), np.concatenate(second)
+    off, told = [], []
+    for _ in range(30):
+        noise = rng.normal(size=(2, *a.shape)) * 0.5
+        matches = Matches(np.array(pairs), a + noise[0], b + noise[1], np.ones(len(a)))
+        found = adjust(matches, true, LENS)
+        turned = found.rotations @ np.swapaxes(true, 1, 2)
+        v = np.stack([turned[:, 2, 1], turned[:, 0, 2], turned[:, 1, 0]], axis=-1)
+        off.append(v - v.mean(axis=0))
+        told.append(found.sigma)
+    # the worst axis of each frame: the median of 7 that scatter by 13 % each
+    got = np.sqrt(np.mean(np.square(off), axis=0)).max(axis=1)
+    assert np.median(got / np.mean(told, axis=0)) == pytest.approx(1, abs=0.25)
+
+
+def test_a_wrong_focal_length_is_found() -> None:
+    values = LENS.intrinsics.copy()
+    values[0] *= 1.2
+    wrong = CameraModel(LENS.model, values, SIZE, max_angle=LENS.max_angle)
+    for prior in (None, tracker()):
+        found = orient(features(), wrong, freedom=Freedom(True, True), prior=prior)
+        assert misplaced(found.rotations, turns()) < 0.1
+        q = np.array([[20.0, 30.0], [280.0, 100.0], [149.5, 190.0]])
+        same = found.camera.unproject(q) @ LENS.unproject(q).T
+        assert np.degrees(np.arccos(np.minimum(np.diag(same), 1))).max() < 0.2
+
+
+def test_a_flipped_reading_is_recognised() -> None:
+    prior = tracker()
+    flipped = prior.rotations.copy()
+    flipped[2] = rotation(math.pi, 0.0, 0.0) @ flipped[2]
+    found = solved(prior=Prior(flipped, prior.sigma))
+    assert found.doubted == (2,)
+    assert misplaced(found.rotations, turns()) < 0.05
+    assert any("tracker is wrong" in note and "3 by 1" in note for note in found.notes)
+
+
+def test_a_drifting_tracker_is_recognised() -> None:
+    prior = tracker(0.0)
+    drift = np.array([rotation(math.radians(1.0 * k), 0.0, 0.0) for k in range(7)])
+    found = solved(prior=Prior(drift @ prior.rotations, prior.sigma))
+    assert misplaced(found.rotations, turns()) < 0.05
+    assert any("drifts" in note for note in found.notes)
+
+
+def test_frames_without_overlap() -> None:
+    apart = [0, 1, 3]  # 120 degrees between the last and the others
+    few = [features()[k] for k in apart]
+    with pytest.raises(UserError, match=r"2 groups .* a, b; c"):
+        orient(few, LENS, names=["a", "b", "c"])
+    prior = tracker()
+    found = orient(
+        few,
+        LENS,
+        prior=Prior(prior.rotations[apart], prior.sigma[apart]),
+        names=["a", "b", "c"],
+    )
+    assert [list(g) for g in found.groups] == [[0, 1], [2]]
+    assert any("placed by the tracker alone" in note for note in found.notes)
+    assert angle_between(found.rotations[2], prior.rotations[3]) < math.radians(0.8)
+
+
+def test_tiles_are_told_apart_by_the_tracker() -> None:
+    def tiled(d: Array) -> NDArray[np.float32]:
+        x, y, z = np.moveaxis(np.nan_to_num(d), -1, 0)
+        lon, lat = np.arctan2(x, z), np.arcsin(np.clip(y, -1, 1))
+        # the same every 15 degrees around
+        a, b = 24 * lon, 20 * lat
+        mark = np.sin(a) * np.cos(b) + 0.6 * np.sin(2 * a + 1) * np.sin(3 * b) + np.cos(b / 2)
+        return np.exp(np.stack([mark] * 3, axis=-1)).astype(np.float32)
+
+    mapping = of_camera(LENS)
+    true = turns()[:6]
+    seen = [find(tiled(mapping.turned(r).directions())) for r in true]
+    prior = Prior(tracker().rotations[:6], tracker().sigma[:6])
+    found = orient(seen, LENS, prior=prior)
+    assert misplaced(found.rotations, true) < 0.1
+
+
+# ---- light
+
+
+def test_exposures_and_fall_off_are_found_and_the_energy_stays() -> None:
+    rng = np.random.default_rng(4)
+    given = rng.normal(size=7) * 0.2
+    given -= given.mean()
+    x, y = np.meshgrid(np.arange(SIZE[0], dtype=float), np.arange(SIZE[1], dtype=float))
+    r2 = radius2(LENS, np.stack([x, y], axis=-1))
+    fall = (1 - 0.3 * r2 + 0.05 * r2**2)[..., None]
+    frames = [
+        Frame(str(k), (p * fall * math.exp(e)).astype(np.float32))
+        for k, (p, e) in enumerate(zip(pictures(), given, strict=True))
+    ]
+    light = solve(frames, LENS, turns())
+    assert np.abs(light.exposure[:, 1] - given).max() < 2e-3
+    at = np.linspace(0, 1, 5)[:, None] ** np.arange(1, 4)
+    assert np.abs(at @ light.falloff - (-0.3 * at[:, 0] + 0.05 * at[:, 1])).max() < 5e-3
+    width = 512
+    result = compose(frames, LENS, turns(), width, light)
+    target = LatLong((width, width // 2))
+    truth, solid = world(target.directions()), target.solid_angles()
+    seen = result.alpha > 0.999
+    energy = [float((p.sum(axis=2) * solid)[seen].sum()) for p in (result.radiance, truth)]
+    assert energy[0] == pytest.approx(energy[1], rel=3e-3)
+    inner = seen & (solid > 0.3 * solid.max())
+    error = np.abs(result.radiance / truth - 1)[inner]
+    assert np.percentile(error, 99) < 0.05
+
+
+def test_exposures_that_agree_are_kept() -> None:
+    frames = [Frame(str(k), p) for k, p in enumerate(pictures())]
+    light = solve(frames, LENS, turns())
+    result = compose(frames, LENS, turns(), 512, light)
+    solid = LatLong((512, 256)).solid_angles()
+    truth = world(LatLong((512, 256)).directions())
+    seen = result.alpha > 0.999
+    energy = [float((p.sum(axis=2) * solid)[seen].sum()) for p in (result.radiance, truth)]
+    assert energy[0] == pytest.approx(energy[1], rel=1e-3)
+    assert abs(result.blend_energy) < 1e-4
+    assert result.seams.moved_solid_angle == 0
+
+
+def test_a_sun_is_one_sun_and_does_not_ring() -> None:
+    sun = np.array([math.sin(0.55), 0.1, math.cos(0.55)])  # on a seam
+    sun /= np.linalg.norm(sun)
+    mapping = of_camera(LENS)
+    frames = []
+    for k, (picture, turn) in enumerate(zip(pictures(), turns(), strict=True)):
+        q = mapping.turned(turn).pixels_of(sun[None])[0]
+        lit = picture.copy()
+        if np.isfinite(q).all() and (q > 0).all() and (q < np.array(SIZE) - 1).all():
+            x, y = np.round(q).astype(int)
+            lit[y, x] += 1e6 / mapping.solid_angles()[y, x] * 1e-5
+        frames.append(Frame(str(k), lit))
+    plain = [Frame(str(k), p) for k, p in enumerate(pictures())]
+    light = unchanged(7)
+    with_sun = compose(frames, LENS, turns(), 512, light)
+    without = compose(plain, LENS, turns(), 512, light)
+    extra = with_sun.radiance - without.radiance
+    solid = LatLong((512, 256)).solid_angles()
+    for c in range(3):
+        assert float((extra[..., c] * solid).sum()) == pytest.approx(10.0, rel=0.02)
+    d = LatLong((512, 256)).directions()
+    far = d @ sun < math.cos(math.radians(6))
+    assert np.abs(extra[far]).max() < 0.02
+    assert with_sun.radiance.min() >= 0
+
+
+def test_what_moved_is_taken_whole_from_one_frame() -> None:
+    """A person stands in the overlap of two frames at two places: each is there or not."""
+    mapping = of_camera(LENS)
+    places = {0: 0.45, 1: 0.62}  # yaw in radians, in both frames
+    frames = []
+    for k, (picture, turn) in enumerate(zip(pictures(), turns(), strict=True)):
+        person = picture.copy()
+        if k in places:
+            # turned by +yaw is towards +X of the world's left
+            at = np.array([math.sin(places[k]), 0.0, math.cos(places[k])])
+            near = np.nan_to_num(mapping.turned(turn).directions()) @ at
+            person[near > math.cos(math.radians(4))] = 5.0
+        frames.append(Frame(str(k), person))
+    result = compose(frames, LENS, turns(), 512, unchanged(7))
+    d = LatLong((512, 256)).directions()
+    for yaw in places.values():
+        at = np.array([math.sin(yaw), 0.0, math.cos(yaw)])
+        inside = d @ at > math.cos(math.radians(3))
+        share = np.abs(result.radiance[inside] / 5.0 - 1).max(axis=1) < 0.1
+        # whole, or gone
+        assert share.mean() > 0.97 or share.mean() < 0.1
+    assert result.seams.places >= 1
+
+
+# ---- the lens
+
+
+@pytest.mark.parametrize(
+    ("model", "expected"),
+    [
+        ("equisolid", 4 * math.asin(23.6 / (4 * 10.5))),
+        ("pinhole", 2 * math.atan(23.6 / 21)),
+        ("equidistant", 23.6 / 10.5),
+    ],
+)
+def test_field_of_view_of_a_frame(model: str, expected: float) -> None:
+    fov = fov_of_frame(model, 23.6, 10.5)
+    assert fov == pytest.approx(expected)
+    lens, guess = parse_lens(f"{model}:10.5mm:23.6", (401, 267))
+    assert not guess
+    edge = lens.unproject(np.array([-0.5, 133.0]))
+    assert math.acos(edge[2]) == pytest.approx(fov / 2, abs=1e-9)
+
+
+@pytest.mark.parametrize("spec", ["equisolid:1mm:50", "nonsense", "pinhole:190", "equisolid:x"])
+def test_lenses_that_are_none(spec: str) -> None:
+    with pytest.raises(UserError):
+        parse_lens(spec, (400, 300))
+
+
+# ---- the command
+
+
+def run(*arguments: object) -> None:
+    build_app()([str(a) for a in arguments], result_action="return_value")
+
+
+def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    files = []
+    for k, picture in enumerate(pictures()):
+        files.append(tmp_path / f"f{k}.exr")
+        write_exr(files[-1], picture)
+    rows = [
+        {"file": f"f{k}.exr", "world_from_camera": r.tolist()}
+        for k, r in enumerate(tracker().rotations)
+    ]
+    (tmp_path / "t.json").write_text(json.dumps({"sigma_degrees": 0.7, "frames": rows}))
+    out = tmp_path / "env.exr"
+    run(
+        *("envmap", "stitch", *files, "--lens", "equisolid:10.5mm:23.6", "--refine", "none"),
+        *("--directions", tmp_path / "t.json", "--width", 256, "-o", out, "--json"),
+    )
+    figures = json.loads(capsys.readouterr().out)
+    assert figures["connected"] == 7
+    assert figures["residual_px"]["median"] < 0.5
+    assert max(figures["sigma_degrees"]) < 0.05
+    assert abs(figures["check_ratio"][0] - 1) < 0.02
+    image = read_image(out)
+    assert image.size == (256, 128)
+    assert image.channels == ("R", "G", "B", "A")
+    for suffix in ("preview.png", "seams.png", "check.png", "cameramodel", "directions.json"):
+        assert (tmp_path / f"env.{suffix}").is_file()
+    assert read_json(tmp_path / "env.exr.record.json")["stage"] == "envmap stitch"
+    # its own directions and lens are understood
+    run(
+        *("envmap", "stitch", *files, "--camera", tmp_path / "env.cameramodel"),
+        *("--directions", tmp_path / "env.directions.json", "--width", 64),
+        *("-o", tmp_path / "again.exr"),
+    )
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--pitch", "0,0"], "need --yaw"),
+        (["--yaw", "0,180", "--directions", "x.json"], "not both"),
+        (["--sigma", "1"], "--sigma"),
+        (["--lens", "pinhole:60", "--camera", "x.cameramodel"], "not both"),
+        (["--yaw", "0,1,2"], "2 numbers"),
+    ],
+)
+def test_mistakes(tmp_path: Path, options: list[str], message: str) -> None:
+    files = [tmp_path / "a.exr", tmp_path / "b.exr"]
+    with pytest.raises(UserError, match=message):
+        run("envmap", "stitch", *files, *options, "-o", tmp_path / "env.exr")
