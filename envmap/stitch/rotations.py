@@ -31,7 +31,7 @@ type Array = NDArray[np.float64]
 #: The scatter of good features in pixels; robust scales go no lower.
 FEATURE = 0.3
 #: The robust scale in medians of the residuals where their tail is long (the 80th percentile
-#: over the median; 1.52 for noise): the better half counts. REACH: scales at which a match ends.
+#: over the median; 1.52 for noise): the better half counts. A match ends at REACH scales.
 HALF, TAIL = 0.4, 1.75
 REACH = 2.5
 ITERATIONS = 50
