@@ -47,21 +47,45 @@ class Projection:
     def project(self, directions: NDArray[np.float64], /) -> NDArray[np.float64]: ...
     def unproject(self, pixels: NDArray[np.float64], /) -> NDArray[np.float64]: ...
 
-def warp(
-    source: NDArray[np.float32],
-    valid: NDArray[np.bool_],
-    source_solid: NDArray[np.float32],
-    target_solid: NDArray[np.float32],
-    from_: Projection,
-    to: Projection,
-    source_from_target: NDArray[np.float64],
+class Resampling:
+    def __init__(
+        self,
+        rgb: NDArray[np.float32],
+        valid: NDArray[np.bool_] | None,
+        source_solid: NDArray[np.float32],
+        target_solid: NDArray[np.float32],
+        variance: NDArray[np.float32] | None,
+        source: Projection,
+        target: Projection,
+        source_from_target: NDArray[np.float64],
+        cap: float,
+        typical: float,
+        smooth: bool,
+    ) -> None: ...
+    def scatter(self, hot: NDArray[np.int64], /) -> None: ...
+    def rows(
+        self, first: int, last: int, /
+    ) -> tuple[
+        NDArray[np.float32],
+        NDArray[np.float32],
+        NDArray[np.float32] | None,
+        NDArray[np.float64],
+    ]: ...
+    def fast(
+        self, energy: list[float] | None
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float64], list[float]]: ...
+    def forget(self) -> None: ...
+    def outside(self) -> list[float]: ...
+
+def survey(
+    rgb: NDArray[np.float32],
+    valid: NDArray[np.bool_] | None,
+    solid: NDArray[np.float32],
     cap: float,
-    smooth: bool,
-    /,
-) -> tuple[
-    NDArray[np.float32],
-    NDArray[np.float32],
-    int,
-    tuple[float, float, float],
-    tuple[float, float, float],
-]: ...
+) -> tuple[NDArray[np.float64], int]: ...
+def hot_pixels(
+    rgb: NDArray[np.float32],
+    valid: NDArray[np.bool_] | None,
+    solid: NDArray[np.float32],
+    cap: float,
+) -> NDArray[np.int64]: ...

@@ -7,7 +7,10 @@ coarse, the pixels' own areas. What rises far above the mean is scattered as ene
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,10 +18,11 @@ from numpy.typing import NDArray
 from chromeball.envmap import kernel
 from chromeball.envmap.mapping import Mapping
 
-#: A pixel's radiance above this many times the map's mean is scattered, not sampled; fewer
-#: times in a small map, so that a pixel's sampled part is at most SHARE of the map's energy.
-HOT = (4.0, 30.0)
-SHARE = 1e-4
+#: A pixel's radiance above this many times the mean is scattered, not sampled. The mean is that
+#: of what is not scattered, so a sun does not raise it.
+HOT = 20.0
+
+type Quality = Literal["best", "fast"]
 
 
 @dataclass(frozen=True)
@@ -28,7 +32,9 @@ class Warped:
     ``radiance`` (H, W, 3) float32 is the mean over the part of the pixel that the source
     covers; ``coverage`` (H, W) float32 is that part, 0..1. Energies are sums of L dOmega per
     channel: ``source_energy`` of all valid source pixels, ``energy`` of the result
-    (times coverage), ``outside`` of hot pixels that the target does not see.
+    (times coverage), ``outside`` of hot pixels that the target does not see. ``sigma``
+    (H, W, 3) is the radiance's standard deviation, where the source's was given. ``balance``:
+    the factors by which the fast way put the channels' energies right.
     """
 
     radiance: NDArray[np.float32]
@@ -37,6 +43,17 @@ class Warped:
     energy: NDArray[np.float64]
     outside: NDArray[np.float64]
     hot_pixels: int
+    sigma: NDArray[np.float32] | None = None
+    balance: tuple[float, ...] = (1.0, 1.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What a source holds: ``energy`` (3,), and the radiance ``cap`` that hot pixels exceed."""
+
+    energy: NDArray[np.float64]
+    cap: float
+    typical: float  # solid angle of a usable pixel
 
 
 def warp(
@@ -47,6 +64,8 @@ def warp(
     rotation: NDArray[np.float64] | None = None,
     valid: NDArray[np.bool_] | None = None,
     smooth: bool | None = None,
+    sigma: NDArray[np.float32] | None = None,
+    quality: Quality = "best",
 ) -> Warped:
     """Resample (H, W, 3) `radiance` of `source` to `target`.
 
@@ -54,58 +73,104 @@ def warp(
     the usable pixels; those outside the lens circle are left out in any case. `smooth`
     chooses the spline (True) or the pixels' areas (False); None decides by the density.
 
+    `quality` fast takes one bilinear sample a pixel and, where both maps are whole spheres,
+    puts the energy right by one factor a channel; a coarser target is made from the pixels'
+    areas in any case.
+
+    `sigma` (H, W, 3), standard deviations of independent pixels, is carried along through the
+    weights of the base. Neighbours in the result share source pixels, so their errors are
+    correlated: do not add their variances up.
+
     Raises
     ------
     ValueError
         When an array does not fit its mapping, or radiance is negative or not finite.
 
     """
-    if radiance.shape != (source.size[1], source.size[0], 3):
-        raise ValueError(f"{radiance.shape} does not fit a map of {source.size}")
-    solid = source.solid_angles()
-    usable = solid > 0
-    if valid is not None:
-        usable &= valid
+    shape = (source.size[1], source.size[0], 3)
+    for array in (radiance, sigma):
+        if array is not None and array.shape != shape:
+            raise ValueError(f"{array.shape} does not fit a map of {source.size}")
     radiance = np.ascontiguousarray(radiance, np.float32)
-    red, green, blue = np.moveaxis(radiance, 2, 0)
-    top = np.maximum(np.maximum(red, green), blue)  # NaN if any is
-    lowest = np.minimum(np.minimum(red, green), blue)
-    if not (usable <= (np.isfinite(top) & (lowest >= 0))).all():
-        raise ValueError("radiance is negative or not finite")
-    if not usable.all():
-        top[~usable] = 0
-    weight = np.where(usable, solid, 0.0)
-    covered = float(weight.sum())
-    mean = float((top * weight).sum()) / covered if covered > 0 else 0.0
-    target_solid = target.solid_angles()
-    if smooth is None:
-        smooth = _density(target_solid) > _density(solid) / 1.5
-    pixels = covered * _density(solid) ** 2  # pixels in the map
-    cap = mean * float(np.clip(SHARE * pixels, *HOT)) if mean > 0 else 1.0
-    turn = np.eye(3) if rotation is None else rotation
-    source_from_target = source.rotation.T @ turn.T @ target.rotation
-    out, coverage, hot, _, outside = kernel.warp(
-        radiance,
-        np.ascontiguousarray(usable),
-        solid.astype(np.float32),
-        target_solid.astype(np.float32),
-        source.kernel,
-        target.kernel,
-        np.ascontiguousarray(source_from_target),
-        cap,
-        bool(smooth),
-    )
-    energy = np.einsum("hwc,hw->c", out, target_solid * coverage, dtype=np.float64)
+    mask = None if valid is None else np.ascontiguousarray(valid)
+    found = survey(lambda cap: kernel.survey(radiance, mask, source.omega, cap), source)
+    hot = kernel.hot_pixels(radiance, mask, source.omega, found.cap)
+    variance = None
+    if sigma is not None:
+        variance = np.square(np.where(np.isfinite(sigma), sigma, 0), dtype=np.float32)
+    job = resampling(radiance, source, target, found, rotation, mask, smooth, variance)
+    job.scatter(hot)
+    balance: tuple[float, ...] = (1.0, 1.0, 1.0)
+    if quality == "fast" and is_smooth(source, target, smooth) and variance is None:
+        whole = mask is None and source.whole and target.whole
+        out, coverage, energy, factors = job.fast(found.energy.tolist() if whole else None)
+        balance = tuple(factors)
+    else:
+        out, coverage, variance, energy = job.rows(0, target.size[1])
     return Warped(
         radiance=out,
         coverage=coverage,
-        source_energy=np.einsum("hwc,hw->c", radiance, weight, dtype=np.float64),
-        energy=energy,
-        outside=np.array(outside),
-        hot_pixels=hot,
+        source_energy=found.energy,
+        energy=energy.sum(axis=0),
+        outside=np.array(job.outside()),
+        hot_pixels=len(hot),
+        sigma=None if variance is None else np.sqrt(variance),
+        balance=balance,
     )
 
 
-def _density(solid: NDArray[np.float64]) -> float:
-    """Pixels a radian, typically."""
-    return float(1 / np.sqrt(np.median(solid[solid > 0][::31])))
+def survey(
+    sums_of: Callable[[float], tuple[NDArray[np.float64], int]], source: Mapping
+) -> Survey:
+    """The survey from ``sums_of(cap)``: sums of each row (H, 5), and the number of bad pixels.
+
+    The sums are over the solid angles: 1, the largest channel under the cap, R, G, B.
+
+    Raises
+    ------
+    ValueError
+        When radiance is negative or not finite.
+
+    """
+    sums, bad = sums_of(math.inf)
+    if bad:
+        raise ValueError(f"radiance of {bad} pixels is negative or not finite")
+    covered, top, *energy = sums.sum(axis=0)
+    cap = HOT * float(top / covered) if top > 0 else 1.0
+    for _ in range(4 if top > 0 else 0):
+        before, cap = cap, HOT * float(sums_of(cap)[0][:, 1].sum() / covered)
+        if cap > 0.8 * before:
+            break
+    return Survey(energy=np.array(energy), cap=cap, typical=1 / source.density**2)
+
+
+def resampling(
+    radiance: NDArray[np.float32],
+    source: Mapping,
+    target: Mapping,
+    found: Survey,
+    rotation: NDArray[np.float64] | None,
+    valid: NDArray[np.bool_] | None,
+    smooth: bool | None,
+    variance: NDArray[np.float32] | None,
+) -> kernel.Resampling:
+    """The kernel set up; rows of the result can be asked for in any order."""
+    turn = np.eye(3) if rotation is None else rotation
+    return kernel.Resampling(
+        radiance,
+        valid,
+        source.omega,
+        target.omega,
+        variance,
+        source.kernel,
+        target.kernel,
+        np.ascontiguousarray(source.rotation.T @ turn.T @ target.rotation),
+        found.cap,
+        found.typical,
+        is_smooth(source, target, smooth),
+    )
+
+
+def is_smooth(source: Mapping, target: Mapping, wish: bool | None = None) -> bool:
+    """Whether a target is fine enough for the spline, or for linear samples."""
+    return target.density > source.density / 1.5 if wish is None else wish

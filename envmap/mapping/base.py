@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -42,6 +43,23 @@ class Mapping(ABC):
     @abstractmethod
     def kernel(self) -> Projection:
         """The same mapping for the C++ kernel."""
+
+    @cached_property
+    def omega(self) -> NDArray[np.float32]:
+        """:meth:`solid_angles` for the kernel: (H, W), or (H, 1) where a row is all the same."""
+        return self.solid_angles().astype(np.float32)
+
+    @cached_property
+    def density(self) -> float:
+        """Pixels a radian, typically."""
+        omega = self.omega.reshape(-1)
+        step = max(1, len(omega) // 20_000) | 1
+        return float(1 / np.sqrt(np.median(omega[omega > 0][::step])))
+
+    @cached_property
+    def whole(self) -> bool:
+        """Whether it sees the whole sphere."""
+        return abs(float(self.omega.sum(dtype=float)) - 4 * math.pi) < 1e-4
 
     def pixels_of(self, world: ArrayLike) -> Array:
         """Directions in world axes to pixels, ``(..., 3) -> (..., 2)``; NaN where unseen."""

@@ -7,7 +7,7 @@ from functools import cached_property
 from typing import override
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from chromeball.envmap.kernel import Projection
 from chromeball.envmap.mapping.base import Array, Mapping
@@ -31,12 +31,24 @@ class LatLong(Mapping):
 
     @override
     def solid_angles(self) -> Array:
+        return np.repeat(self._rows()[:, None], self.size[0], axis=1)
+
+    def _rows(self) -> Array:
         width, height = self.size
         edges = np.linspace(-math.pi / 2, math.pi / 2, height + 1)
         # sin b - sin a without cancellation
         middle, half = (edges[1:] + edges[:-1]) / 2, math.pi / (2 * height)
-        row = 2 * np.cos(middle) * math.sin(half) * (2 * math.pi / width)
-        return np.repeat(row[:, None], width, axis=1)
+        return 2 * np.cos(middle) * math.sin(half) * (2 * math.pi / width)
+
+    @cached_property
+    @override
+    def omega(self) -> NDArray[np.float32]:
+        return self._rows().astype(np.float32)[:, None]
+
+    @cached_property
+    @override
+    def whole(self) -> bool:
+        return True
 
     @cached_property
     @override
