@@ -3,32 +3,23 @@
 // scattered as ever.
 #pragma once
 
-#include <memory>
-
 #include "warp.h"
 
 namespace envmap {
 
 class Fast {
  public:
-  explicit Fast(const Source& source)
-      : from_(source.projection),
-        stride_(from_.sheet_width() + 2),
-        per_sheet_(stride_ * (from_.sheet_height() + 2)),
-        pixels_(std::make_unique_for_overwrite<Float4[]>(
-            std::size_t(per_sheet_ * from_.sheets()))) {
-    const int w = from_.sheet_width(), h = from_.sheet_height(), rows = h + 2;
-    for_rows(0, rows * from_.sheets(), [&](int row) {
-      const int sheet = row / rows, y = row % rows - 1;
-      Float4* out = &pixels_[std::size_t(sheet * per_sheet_ + Index(y + 1) * stride_)];
-      const bool edge = y < 0 || y >= h;
-      out[0] = source.beyond(sheet, -1, y);
-      out[w + 1] = source.beyond(sheet, w, y);
-      if (edge)
-        for (int x = 0; x < w; ++x) out[x + 1] = source.beyond(sheet, x, y);
-      else
-        fill(source, from_.pixel(sheet, 0, y), w, out + 1);
-    });
+  Fast(const Source& source, const Index* hot, std::size_t count)
+      : source_(source),
+        from_(source.projection),
+        across_((from_.width >> kTile) + 1),
+        special_(std::size_t(across_ * ((from_.height >> kTile) + 1))) {
+    for (std::size_t k = 0; k < count; ++k)
+      mark(hot[k] % from_.width, hot[k] / from_.width);
+    if (source.solid.across == 0 && !source.valid) return;
+    for (int y = 0; y < from_.height; ++y)
+      for (int x = 0; x < from_.width; ++x)
+        if (!source.usable({x, y})) mark(x, y);
   }
 
   // The base of all rows, and the sums of each row, (H, 3).
@@ -55,16 +46,40 @@ class Fast {
   }
 
  private:
-  static void fill(const Source& source, Cell first, int n, Float4* out) {
-    const float* rgb = source.rgb + 3 * source.index(first);
-    if (source.solid.across == 0 && !source.valid) {
-      for (int x = 0; x < n; ++x, rgb += 3) {
-        const float s = base_share(rgb, source.cap);
-        out[x] = Float4{s * rgb[0], s * rgb[1], s * rgb[2], 1};
-      }
-    } else {
-      for (int x = 0; x < n; ++x) out[x] = source.base({first.x + x, first.y});
+  static constexpr int kTile = 4;  // tiles of 16 x 16 pixels
+
+  // The tiles from whose pixels a bilinear sample may look at this one are not plain.
+  void mark(Index x, Index y) {
+    for (Index v = std::max<Index>(y - 1, 0); v <= y; ++v)
+      for (Index u = std::max<Index>(x - 1, 0); u <= x; ++u)
+        special_[std::size_t((v >> kTile) * across_ + (u >> kTile))] = 1;
+  }
+
+  // Between four pixels, and 1: read as they are where nothing is hot, missing or at an edge.
+  Float4 sample(int sheet, float px, float py) const {
+    const float x = std::floor(px), y = std::floor(py), s = px - x, t = py - y;
+    const int i = int(x), j = int(y);
+    const Cell c = from_.pixel(sheet, i, j);
+    const bool inner = (i >= 0) & (j >= 0) & (i < from_.sheet_width() - 1) &
+                       (j < from_.sheet_height() - 1) & (c.y < from_.height - 2);
+    if (inner && !special_[std::size_t((c.y >> kTile) * across_ + (c.x >> kTile))]) {
+      const float* p = source_.rgb + 3 * source_.index(c);
+      const float* q = p + 3 * Index(from_.width);
+      const Float4 a = load(p), b = load(q);
+      const Float4 top = a + s * (load(p + 3) - a), low = b + s * (load(q + 3) - b);
+      Float4 value = top + t * (low - top);
+      value[3] = 1;
+      return value;
     }
+    const auto at = [&](int u, int v) { return source_.beyond(sheet, u, v); };
+    return (1 - t) * ((1 - s) * at(i, j) + s * at(i + 1, j)) +
+           t * ((1 - s) * at(i, j + 1) + s * at(i + 1, j + 1));
+  }
+
+  // Three channels and what follows.
+  static Float4 load(const float* p) {
+    typedef float Loose __attribute__((vector_size(16), aligned(4), may_alias));
+    return *reinterpret_cast<const Loose*>(p);
   }
 
   void look(const Rays& rays, const Places& p, int n, const float* solid, Index across, float* out,
@@ -72,15 +87,8 @@ class Fast {
     Float4 total{};
     for (int k = 0; k < n; ++k) {
       Float4 value{};
-      if (p.sheet[k] >= 0 && rays.jacobian[k] > 0 && solid[k * across] > 0) {
-        const float x = std::floor(p.x[k]), y = std::floor(p.y[k]);
-        const float s = p.x[k] - x, t = p.y[k] - y;
-        const Float4* c = &pixels_[std::size_t(p.sheet[k] * per_sheet_ +
-                                               (Index(y) + 1) * stride_ + Index(x) + 1)];
-        const Float4 top = c[0] + s * (c[1] - c[0]);
-        const Float4 low = c[stride_] + s * (c[stride_ + 1] - c[stride_]);
-        value = top + t * (low - top);
-      }
+      if (p.sheet[k] >= 0 && rays.jacobian[k] > 0 && solid[k * across] > 0)
+        value = sample(p.sheet[k], p.x[k], p.y[k]);
       const float seen = value[3];
       total += solid[k * across] * value;
       if (seen > 0 && seen < 1) value = value / seen;
@@ -90,9 +98,10 @@ class Fast {
     for (int c = 0; c < 3; ++c) sums[c] += total[c];
   }
 
+  const Source& source_;
   const Projection& from_;
-  Index stride_, per_sheet_;
-  std::unique_ptr<Float4[]> pixels_;  // of each sheet, with a pixel more around it
+  Index across_;
+  std::vector<std::uint8_t> special_;
 };
 
 }  // namespace envmap

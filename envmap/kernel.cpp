@@ -80,8 +80,8 @@ class Resampling {
     for (std::size_t k = 0; k < hot.size(); ++k)
       if (hot.data()[k] < 0 || hot.data()[k] >= Index(from_.width) * from_.height)
         throw std::out_of_range("no such pixel");
-    static_assert(sizeof(Index) == sizeof(std::int64_t));
-    warp_.scatter(reinterpret_cast<const Index*>(hot.data()), hot.size());
+    hot_.assign(hot.data(), hot.data() + hot.size());
+    warp_.scatter(hot_.data(), hot_.size());
   }
 
   auto rows(int first, int last) {
@@ -113,7 +113,7 @@ class Resampling {
     {
       nb::gil_scoped_release release;
       const Solid solid = solid_of(target_solid_, to_);
-      Fast(source_).gather(to_, solid, turn_, band);
+      Fast(source_, hot_.data(), hot_.size()).gather(to_, solid, turn_, band);
       if (energy) {
         for (std::size_t c = 0; c < 3; ++c) {
           double gathered = 0;
@@ -143,6 +143,7 @@ class Resampling {
   Projection from_, to_;
   Source source_;
   Matrix turn_;
+  std::vector<Index> hot_;
   Warp warp_;
 };
 
@@ -158,7 +159,10 @@ auto survey(const Rgb& rgb, const std::optional<Mask>& valid, const Plane& solid
   {
     nb::gil_scoped_release release;
     for_rows(0, int(h), [&](int y) {
-      const RowSums row = survey_row(rgb.data() + 3 * w * y, valid ? valid->data() + w * y : nullptr,
+      RowSums row;
+      const bool even = omega.across == 0 && !valid;
+      if (!even || !survey_even_row(rgb.data() + 3 * w * y, omega(0, y), w, cap, row))
+        row = survey_row(rgb.data() + 3 * w * y, valid ? valid->data() + w * y : nullptr,
                                      omega.values + omega.down * y, omega.across, w, cap);
       std::copy(row.sum, row.sum + 5, out + 5 * Index(y));
       bad += row.bad;
