@@ -30,17 +30,24 @@ class Fast {
       thread_local Places places;
       thread_local float u[kBatch], v[kBatch];
       double* sums = band.energy + 3 * Index(y);
-      for (int first = 0; first < to.width; first += kBatch) {
-        const int n = std::min(kBatch, to.width - first);
+      constexpr int batch = 128;
+      for (int first = 0; first < to.width; first += batch) {
+        const int n = std::min(batch, to.width - first);
+        const Index row = Index(y) * to.width + first;
+        const float* omega = solid.values + y * solid.down + first * solid.across;
+        if (solid.across && std::all_of(omega, omega + n, [](float o) { return !(o > 0); })) {
+          std::fill_n(band.radiance + 3 * row, 3 * n, 0.f);  // beside the cross, around the disc
+          std::fill_n(band.coverage + row, n, 0.f);
+          continue;
+        }
         for (int k = 0; k < n; ++k) u[k] = float(first + k), v[k] = float(y);
         to.unproject(u, v, n, rays);
         // at a disc's rim the nearest point stands for a centre that is outside
         if (to.kind == Projection::Kind::radial) std::fill_n(rays.jacobian, n, 1.f);
         rays.turn(source_from_target, n);
         from_.project(rays, n, places);
-        const Index row = Index(y) * to.width + first;
-        look(rays, places, n, solid.values + y * solid.down + first * solid.across, solid.across,
-             band.radiance + 3 * row, band.coverage + row, sums);
+        look(rays, places, n, omega, solid.across, band.radiance + 3 * row,
+             band.coverage + row, sums);
       }
     });
   }
@@ -55,22 +62,10 @@ class Fast {
         special_[std::size_t((v >> kTile) * across_ + (u >> kTile))] = 1;
   }
 
-  // Between four pixels, and 1: read as they are where nothing is hot, missing or at an edge.
-  Float4 sample(int sheet, float px, float py) const {
+  // Between four pixels where one may be hot, missing, or over the edge; and the seen share.
+  Float4 with_care(int sheet, float px, float py) const {
     const float x = std::floor(px), y = std::floor(py), s = px - x, t = py - y;
     const int i = int(x), j = int(y);
-    const Cell c = from_.pixel(sheet, i, j);
-    const bool inner = (i >= 0) & (j >= 0) & (i < from_.sheet_width() - 1) &
-                       (j < from_.sheet_height() - 1) & (c.y < from_.height - 2);
-    if (inner && !special_[std::size_t((c.y >> kTile) * across_ + (c.x >> kTile))]) {
-      const float* p = source_.rgb + 3 * source_.index(c);
-      const float* q = p + 3 * Index(from_.width);
-      const Float4 a = load(p), b = load(q);
-      const Float4 top = a + s * (load(p + 3) - a), low = b + s * (load(q + 3) - b);
-      Float4 value = top + t * (low - top);
-      value[3] = 1;
-      return value;
-    }
     const auto at = [&](int u, int v) { return source_.beyond(sheet, u, v); };
     return (1 - t) * ((1 - s) * at(i, j) + s * at(i + 1, j)) +
            t * ((1 - s) * at(i, j + 1) + s * at(i + 1, j + 1));
@@ -84,18 +79,52 @@ class Fast {
 
   void look(const Rays& rays, const Places& p, int n, const float* solid, Index across, float* out,
             float* coverage, double* sums) const {
+    float s[kBatch], t[kBatch];
+    std::int32_t column[kBatch], line[kBatch], inner[kBatch];
+    const std::int32_t right = from_.sheet_width() - 1, bottom = from_.sheet_height() - 1;
+    const std::int32_t last = from_.height - 2;
+    // where the faces stand; all 0 where there is one sheet
+    std::int32_t left_of[6]{}, top_of[6]{};
+    for (int i = 0; i < from_.sheets(); ++i) {
+      const Cell corner = from_.pixel(i, 0, 0);
+      left_of[i] = corner.x, top_of[i] = corner.y;
+    }
+#pragma omp simd
+    for (int k = 0; k < n; ++k) {
+      const std::int32_t sheet = p.sheet[k] > 0 ? p.sheet[k] : 0;
+      const float x = std::floor(p.x[k]), y = std::floor(p.y[k]);
+      const std::int32_t i = std::int32_t(x), j = std::int32_t(y);
+      s[k] = p.x[k] - x, t[k] = p.y[k] - y;
+      column[k] = i + left_of[sheet], line[k] = j + top_of[sheet];
+      inner[k] = (p.sheet[k] >= 0) & (i >= 0) & (j >= 0) & (i < right) & (j < bottom) &
+                 (line[k] < last) & (rays.jacobian[k] > 0);
+    }
+    const Index stride = 3 * Index(from_.width);
     Float4 total{};
     for (int k = 0; k < n; ++k) {
       Float4 value{};
-      if (p.sheet[k] >= 0 && rays.jacobian[k] > 0 && solid[k * across] > 0)
-        value = sample(p.sheet[k], p.x[k], p.y[k]);
-      const float seen = value[3];
-      total += solid[k * across] * value;
-      if (seen > 0 && seen < 1) value = value / seen;
+      const float omega = solid[k * across];
+      if (inner[k] && omega > 0 &&
+          !special_[std::size_t((line[k] >> kTile) * across_ + (column[k] >> kTile))]) {
+        const float* above = source_.rgb + stride * line[k] + 3 * Index(column[k]);
+        const float* below = above + stride;
+        const Float4 a = load(above), b = load(below);
+        const Float4 top = a + s[k] * (load(above + 3) - a);
+        const Float4 low = b + s[k] * (load(below + 3) - b);
+        value = top + t[k] * (low - top);
+        value[3] = 1;
+      } else if (p.sheet[k] >= 0 && rays.jacobian[k] > 0 && omega > 0) {
+        value = with_care(p.sheet[k], p.x[k], p.y[k]);
+        if (const float seen = value[3]; seen > 0 && seen < 1) {
+          value = value / seen;
+          value[3] = seen;
+        }
+      }
+      total += (omega * value[3]) * value;
       out[3 * k] = value[0], out[3 * k + 1] = value[1], out[3 * k + 2] = value[2];
-      coverage[k] = seen;
+      coverage[k] = value[3];
     }
-    for (int c = 0; c < 3; ++c) sums[c] += total[c];
+    for (int c = 0; c < 3; ++c) sums[c] += double(total[c]);
   }
 
   const Source& source_;

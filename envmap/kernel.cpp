@@ -213,7 +213,7 @@ Result project(const Projection& p, const Doubles& directions) {
   const std::size_t n = directions.shape(0);
   double* out;
   auto result = make_array<double, Result>({n, 2}, out);
-  Rays rays;
+  Rays rays{};
   Places places;
   for (std::size_t k = 0; k < n; ++k) {
     rays.set(0, {float(directions(k, 0)), float(directions(k, 1)), float(directions(k, 2))});
@@ -231,7 +231,7 @@ Result unproject(const Projection& p, const Doubles& pixels) {
   const std::size_t n = pixels.shape(0);
   double* out;
   auto result = make_array<double, Result>({n, 4}, out);
-  Rays rays;
+  Rays rays{};
   for (std::size_t k = 0; k < n; ++k) {
     const float x = float(pixels(k, 0)), y = float(pixels(k, 1));
     p.unproject(&x, &y, 1, rays);

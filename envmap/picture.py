@@ -22,13 +22,15 @@ class Radiance:
 
     ``rgb`` (H, W, 3) float32; ``valid`` (H, W), or None for all; ``clipped`` (H, W) marks lower
     bounds, saturated in every exposure, or None where the file does not say; ``attributes``
-    worth keeping.
+    worth keeping. ``sigma`` (H, W, 3), the standard deviations of channels ``sigma.R`` ..., or
+    None.
     """
 
     rgb: NDArray[np.float32]
     valid: NDArray[np.bool_] | None
     clipped: NDArray[np.bool_] | None
     attributes: dict[str, Any]
+    sigma: NDArray[np.float32] | None = None
 
     @property
     def size(self) -> tuple[int, int]:
@@ -78,7 +80,12 @@ def read_radiance(path: str | os.PathLike[str]) -> Radiance:
         if name in image.attributes
     }
     clipped = pixels[..., names.index("clipped")] > 0 if "clipped" in names else None
-    return Radiance(np.ascontiguousarray(rgb), valid, clipped, kept)
+    sigma = None
+    if all(f"sigma.{name}" in names for name in "RGB"):
+        sigma = np.ascontiguousarray(
+            pixels[..., [names.index(f"sigma.{name}") for name in "RGB"]]
+        )
+    return Radiance(np.ascontiguousarray(rgb), valid, clipped, kept, sigma)
 
 
 def read_latlong(path: str | os.PathLike[str]) -> Radiance:

@@ -119,6 +119,24 @@ def warp(
     )
 
 
+def carry(
+    mask: NDArray[np.bool_],
+    source: Mapping,
+    target: Mapping,
+    *,
+    rotation: NDArray[np.float64] | None = None,
+    valid: NDArray[np.bool_] | None = None,
+) -> NDArray[np.float32]:
+    """The share of each target pixel, (H, W), that marked source pixels (H, W) cover.
+
+    A mark is not lost between samples: where few are set they are scattered.
+    """
+    marks = np.repeat(mask.astype(np.float32)[..., None], 3, axis=2)
+    share = warp(marks, source, target, rotation=rotation, valid=valid, smooth=False)
+    # pieces that fall to one side or the other of a pixel's edge add up to a little over 1
+    return np.minimum(share.radiance[..., 0], np.float32(1))
+
+
 def survey(
     sums_of: Callable[[float], tuple[NDArray[np.float64], int]], source: Mapping
 ) -> Survey:

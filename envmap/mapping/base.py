@@ -46,7 +46,7 @@ class Mapping(ABC):
 
     @cached_property
     def omega(self) -> NDArray[np.float32]:
-        """:meth:`solid_angles` for the kernel: (H, W), or (H, 1) where a row is all the same."""
+        """:meth:`solid_angles` for the kernel: (H, W), or (H, 1) of even rows."""
         return self.solid_angles().astype(np.float32)
 
     @cached_property

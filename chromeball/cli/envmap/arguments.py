@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from chromeball.scene.camera import CameraModel
     from chromeball.scene.manifest import Probe
 
-type Kind = Literal["mirror", "angular", "fisheye", "paraboloid", "cube", "latlong"]
 type Out = Annotated[Path, Parameter(name=["--output", "-o"])]
 type Json = Annotated[bool, Parameter(negative="")]
 

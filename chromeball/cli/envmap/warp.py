@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 import math
+import sys
+from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from chromeball.cli.envmap.arguments import (
-    Json,
-    Kind,
-    Out,
-    parse_numbers,
-    print_figures,
-    source_fisheye,
-)
+from chromeball.cli.envmap.arguments import Json, Out, parse_numbers, print_figures
+from chromeball.cli.envmap.maps import Optics, files_of, read_map, source_map, target_map
+from chromeball.envmap.names import Kind
 from chromeball.scene.errors import UserError
 
-if TYPE_CHECKING:
-    from chromeball.envmap.mapping import Mapping
+#: A result finer than its source by more than this is told.
+FINER = 1.1
 
 
 def warp(
@@ -28,18 +25,24 @@ def warp(
     *,
     from_: Annotated[Kind, Parameter(name="--from")],
     to: Kind,
-    width: int,
+    width: int | None = None,
     camera: Path | None = None,
     lens: str | None = None,
     to_lens: str | None = None,
+    ball_distance: float | None = None,
+    focal: float | None = None,
     rotate: str | None = None,
+    fast: Annotated[bool, Parameter(negative="")] = False,
     output: Out,
     json: Json = False,
 ) -> None:
     """One map to another, the energy of small bright lights kept.
 
-    A cube is a horizontal cross, 4:3; a mirror ball is a photograph of one, cropped to it.
-    Where the source does not see, the result is black with alpha 0.
+    A cube is a cross, 4:3 (cube) or 3:4 (cube-vertical), a row (cube-strip) or column
+    (cube-column) of px nx py ny pz nz, or six files of these names (cube-files, {} in their
+    place: "pisa_{}.hdr"). A mirror ball is a photograph of one, cropped to it. Where the source
+    does not see, the result is black with alpha 0. Channels sigma.R, sigma.G, sigma.B and
+    clipped are carried along.
 
     Parameters
     ----------
@@ -50,101 +53,111 @@ def warp(
     to
         What to make of it.
     width
-        Of the result, in pixels.
+        Of the result, in pixels, of a face with cube-files; by default what the picture
+        resolves.
     camera
         The fisheye, as a camera model; its pose is not used.
     lens
         The fisheye, as MODEL:FOV[:cx,cy,radius], degrees and pixels.
     to_lens
         The fisheye that is made, where both maps are fisheyes.
+    ball_distance
+        From the camera to the mirror ball's centre, in ball radii; without it the ball is far.
+    focal
+        The focal length in pixels of the camera that photographed the ball, instead.
     rotate
         YAW,PITCH,ROLL in degrees by which the world is turned: what lay ahead moves to the
         left by yaw (right-handed about +Y), up by pitch; roll is clockwise.
+    fast
+        One linear sample a pixel: the energy is kept, edges are softer.
     output
         The map, an EXR.
     json
         Print the figures as JSON.
 
     """
-    import numpy as np
-
-    from chromeball.envmap.mapping import make_mapping, sized
-    from chromeball.envmap.picture import (
-        latlong_attributes,
-        read_radiance,
-        tone_mapped,
-        write_preview,
-    )
+    from chromeball.envmap.picture import latlong_attributes, tone_mapped, write_preview
     from chromeball.envmap.probe import rotation
+    from chromeball.envmap.resample import carry
     from chromeball.envmap.resample import warp as resample
-    from chromeball.scene.image import write_exr
     from chromeball.scene.record import Stage
 
     angles = parse_numbers(rotate, "--rotate", 3) if rotate is not None else [0.0, 0.0, 0.0]
-    if not 2 <= width <= 65536:
-        raise UserError(f"--width {width}: it must be from 2 to 65536")
-    fisheyes = [from_, to].count("fisheye")
-    if to_lens is not None and fisheyes < 2:
-        raise UserError("--to-lens is for a fisheye made of a fisheye; use --lens")
-    if (camera or lens) and not fisheyes:
-        raise UserError("neither map is a fisheye: --lens and --camera have no use")
-    if fisheyes == 2 and to_lens is None:
-        raise UserError("--to-lens is missing: both maps are fisheyes")
-    image = read_radiance(picture)
-    size, kept = image.size, dict(image.attributes)
-    if from_ == "fisheye":
-        source = source_fisheye(lens, camera, size, picture)
+    if width is not None and not 1 <= width <= 65536:
+        raise UserError(f"--width {width}: it must be from 1 to 65536")
+    optics = Optics(lens, to_lens, camera, ball_distance, focal)
+    optics.check(from_, to)
+    inputs = [*files_of(picture, from_), *([camera] if camera else [])]
+    outputs = files_of(output, to)
+    image = read_map(picture, from_)
+    kept = dict(image.attributes)
+    if from_ == to == "mirror":
+        optics_in = Optics(ball_distance=ball_distance, focal=focal)
+        source = source_map(from_, image.size, optics_in, picture)
+        target = target_map(to, width, Optics(), source)  # of a ball nearby the ideal one
     else:
-        try:
-            source = make_mapping(from_, size)
-        except UserError as error:
-            raise UserError(error.what, file=picture) from error
-    target = (
-        _target_fisheye(to_lens if fisheyes == 2 else lens, camera, width, fisheyes == 2)
-        if to == "fisheye"
-        else make_mapping(to, sized(to, width))
-    )
-    with Stage("envmap warp", [picture, *([camera] if camera else [])], to=to) as stage:
+        source = source_map(from_, image.size, optics, picture)
+        target = target_map(to, width, optics, source)
+    turn = rotation(*(math.radians(a) for a in angles))
+    with Stage("envmap warp", inputs, to=to, fast=fast) as stage:
         result = resample(
             image.rgb,
             source,
             target,
-            rotation=rotation(*(math.radians(a) for a in angles)),
+            rotation=turn,
             valid=image.valid,
+            sigma=image.sigma,
+            quality="fast" if fast else "best",
         )
+        planes: list[Any] = [result.radiance, result.coverage[..., None]]
+        channels = ["R", "G", "B", "A"]
+        if result.sigma is not None:
+            planes.append(result.sigma)
+            channels += ["sigma.R", "sigma.G", "sigma.B"]
+        if image.clipped is not None:
+            share = carry(image.clipped, source, target, rotation=turn, valid=image.valid)
+            planes.append(share[..., None])
+            channels.append("clipped")
+            stage.figures["clipped_solid_angle"] = float((target.omega * share).sum())
+        preview = outputs[0] if len(outputs) > 1 else output
         stage.figures |= {
             "size": target.size,
             "energy": result.energy,
             "source_energy": result.source_energy,
+            "balance": result.balance,
             "hot_pixels": result.hot_pixels,
             "hot_energy_outside": result.outside,
-            "seen_solid_angle": float((target.solid_angles() * result.coverage).sum()),
+            "seen_solid_angle": float((target.omega * result.coverage).sum(dtype=float)),
+            "finer_than_source": target.density / source.density,
             "preview": write_preview(
-                output, "preview", tone_mapped(result.radiance, result.coverage)
+                preview, "preview", tone_mapped(result.radiance, result.coverage)
             ),
         }
         if any(angles):
             kept.pop("origin", None)
         attributes = latlong_attributes(kept) if to == "latlong" else kept
-        with stage.output(output) as temporary:
-            write_exr(
-                temporary,
-                np.concatenate([result.radiance, result.coverage[..., None]], axis=2),
-                channels=("R", "G", "B", "A"),
-                attributes=attributes,
-            )
+        _write(stage, outputs, planes, channels, attributes)
+    if target.density > FINER * source.density:
+        print(
+            f"the result is {target.density / source.density:.1f} times as fine as the picture "
+            "resolves: it holds no more detail",
+            file=sys.stderr,
+        )
     print_figures(stage.figures, json, output)
 
 
-def _target_fisheye(lens: str | None, camera: Path | None, width: int, both: bool) -> Mapping:
-    from chromeball.envmap.mapping import of_camera, parse_lens
-    from chromeball.scene.camera import CameraModel
+def _write(
+    stage: Any, outputs: list[Path], planes: list[Any], channels: list[str], attributes: Any
+) -> None:
+    """One file, or a face each."""
+    import numpy as np
 
-    if both:
-        return of_camera(parse_lens(lens or "", (width, width)))
-    if (lens is None) == (camera is None):
-        raise UserError("a fisheye needs --lens or --camera, one of the two")
-    if camera is None:
-        return of_camera(parse_lens(lens or "", (width, width)))
-    model = CameraModel.read(camera)
-    return of_camera(model.scaled(width / model.size[0]))
+    from chromeball.scene.image import write_exr
+
+    pixels = np.concatenate(planes, axis=2)
+    with ExitStack() as stack:  # all six, or none
+        temporaries = [stack.enter_context(stage.output(path)) for path in outputs]
+        for temporary, part in zip(
+            temporaries, np.split(pixels, len(outputs), axis=1), strict=True
+        ):
+            write_exr(temporary, part, channels=channels, attributes=attributes)
