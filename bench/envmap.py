@@ -90,6 +90,10 @@ def _tools() -> dict[str, Tool]:
         result = warp(picture, source, target)
         return result.radiance * result.coverage[..., None]
 
+    def fast(picture: Picture, source: Mapping, target: Mapping) -> Picture:
+        result = warp(picture, source, target, quality="fast")
+        return result.radiance * result.coverage[..., None]
+
     def remap(interpolation: int) -> Tool:
         def run(picture: Picture, source: Mapping, target: Mapping) -> Picture:
             d = np.nan_to_num(target.directions())
@@ -106,6 +110,7 @@ def _tools() -> dict[str, Tool]:
 
     return {
         "chromeball": ours,
+        "chromeball --fast": fast,
         "cv2.remap linear": remap(cv2.INTER_LINEAR),
         "cv2.remap lanczos4": remap(cv2.INTER_LANCZOS4),
     }

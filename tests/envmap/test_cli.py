@@ -280,7 +280,10 @@ def test_bad_maps(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--to", "mirror", "--width", "1"], "--width"),
+        (["--to", "mirror", "--width", "0"], "--width"),
+        (["--to", "latlong", "--ball-distance", "3"], "mirror ball"),
+        (["--to", "mirror", "--ball-distance", "0.5"], "outside"),
+        (["--to", "cube-files"], "px, nx"),
         (["--to", "cube", "--width", "10"], "4:3"),
         (["--to", "fisheye", "--width", "10"], "needs --lens or --camera"),
         (["--to", "fisheye", "--width", "10", "--lens", "nope:180"], "unknown fisheye"),
