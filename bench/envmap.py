@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from bench.envmap_lights import rows as lights_rows
 from bench.row import Row
 from chromeball.envmap.mapping import (
     LatLong,
@@ -48,7 +49,7 @@ def rows(quick: bool) -> list[Row]:
     result: list[Row] = []
     for what, source, target in tasks:
         result += _task(what, source, target)
-    return result
+    return result + lights_rows(quick)
 
 
 def _task(what: str, source: Mapping, target: Mapping) -> list[Row]:

@@ -8,8 +8,9 @@ from chromeball.cli.envmap.lights import lights
 from chromeball.cli.envmap.prefilter import prefilter
 from chromeball.cli.envmap.probe import probe
 from chromeball.cli.envmap.stitch import stitch
+from chromeball.cli.envmap.sun import sun
 from chromeball.cli.envmap.warp import warp
 
 app = App(name="envmap", help="The light around a point.")
-for _command in (warp, align, probe, stitch, lights, harmonics, prefilter):
+for _command in (warp, align, probe, stitch, sun, lights, harmonics, prefilter):
     app.command(_command)

@@ -18,6 +18,8 @@ def lights(
     method: Literal["variance-cut", "grid", "random"] = "variance-cut",
     seed: int = 0,
     ambient: bool = True,
+    lamps: Path | None = None,
+    rest: Path | None = None,
     output: Out,
     json: Json = False,
 ) -> None:
@@ -39,6 +41,11 @@ def lights(
         Of the random sub-list.
     ambient
         Keep the order-2 harmonics of what the lights leave out.
+    lamps
+        Write the map's lamps and windows as [[light]] of a scene file: with a depth at their
+        places and as large as they are, else as suns. They are in lights.json, too.
+    rest
+        The map without those lamps, an EXR: beside it they give the map's light once.
     output
         The lights, lights.json.
     json
@@ -48,15 +55,24 @@ def lights(
     import numpy as np
 
     from chromeball.envmap.grid import grid_lights
+    from chromeball.envmap.lamps import as_scene_lights, find_lamps
     from chromeball.envmap.lights import variance_cut
     from chromeball.envmap.mapping import LatLong
-    from chromeball.envmap.picture import read_latlong, tone_mapped, write_preview
+    from chromeball.envmap.picture import (
+        latlong_attributes,
+        read_latlong,
+        tone_mapped,
+        write_preview,
+    )
+    from chromeball.scene.image import write_exr
     from chromeball.scene.record import Stage, write_json
 
     if not 1 <= count <= 65536:
         raise UserError(f"--count {count}: between 1 and 65536 lights")
     if method != "variance-cut" and depth is not None:
         raise UserError("--depth is for the variance cut: cells of a grid have no one place")
+    if rest is not None and lamps is None:
+        raise UserError("--rest is the map without the lamps that --lamps writes")
     if seed and method != "random":
         raise UserError("--seed is for --method random")
     image = read_latlong(env)
@@ -103,8 +119,22 @@ def lights(
                 output, "preview", _dots(display, small.pixels_of(result.directions))
             ),
         }
+        value = result.to_json()
+        if lamps is not None:
+            found, left = find_lamps(
+                radiance,
+                depth=distance,
+                origin=np.zeros(3) if origin is None else np.ravel(origin),
+            )
+            value["lamps"] = [lamp.to_json() for lamp in found]
+            stage.figures["lamps"] = len(found)
+            with stage.output(lamps) as temporary:
+                temporary.write_text(as_scene_lights(found))
+            if rest is not None:
+                with stage.output(rest) as temporary:
+                    write_exr(temporary, left, attributes=latlong_attributes(kept))
         with stage.output(output) as temporary:
-            write_json(temporary, result.to_json())
+            write_json(temporary, value)
     print_figures(stage.figures, json, output)
 
 

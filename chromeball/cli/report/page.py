@@ -37,7 +37,11 @@ DEEDS = {
     "calibrate lens": "Intrinsics and distortion of the lens, from photographs of a target.",
     "envmap align": "World axes and scale from the corners of a rectangle on the floor.",
     "envmap probe": "The shots of the light probe resampled to one lat-long map in world axes.",
-    "envmap lights": "The map as a few directional lights of the same total irradiance.",
+    "envmap sun": "The light of a sun that every exposure clipped, restored.",
+    "envmap lights": "The map as a few directional lights of the same total irradiance, and the "
+    "harmonics of what they leave out.",
+    "envmap harmonics": "Irradiance in spherical harmonics, with its error.",
+    "envmap prefilter": "The map blurred by the GGX lobe, for real-time engines.",
     "calibrate pose": "Where the photograph was taken from, by four points on the floor.",
     "stand-in build": "Stand-in geometry of the real place, as drawn on the panorama.",
     "stand-in depth": "How far away the light of each direction comes from.",
