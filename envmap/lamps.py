@@ -82,14 +82,14 @@ def find_lamps(
         for a, b in zip(labels[:, 0], np.roll(labels[:, -1], shift), strict=True):
             if a and b:
                 parents[parents == parents[b]] = parents[a]
-    labels = parents[labels]
+    regions = parents[labels]
     rest, place = radiance.copy(), np.asarray(origin, float)
     found: list[tuple[float, Lamp]] = []
-    energies = np.bincount(labels.ravel(), (y * solid).ravel(), count + 1)
+    energies = np.bincount(regions.ravel(), (y * solid).ravel(), count + 1)
     for n in np.flatnonzero(energies >= share * total):
         if n == 0:
             continue
-        region = labels == n
+        region = regions == n
         around = _dilated(region, max(2, round(height / 128))) & ~hot
         behind = np.median(radiance[around], axis=0) if around.any() else np.zeros(3)
         behind = np.minimum(behind, radiance[region].min(axis=0)).astype(float)

@@ -38,8 +38,8 @@ DEEDS = {
     "envmap align": "World axes and scale from the corners of a rectangle on the floor.",
     "envmap probe": "The shots of the light probe resampled to one lat-long map in world axes.",
     "envmap sun": "The light of a sun that every exposure clipped, restored.",
-    "envmap lights": "The map as a few directional lights of the same total irradiance, and the "
-    "harmonics of what they leave out.",
+    "envmap lights": "The map as a few directional lights of the same total irradiance, and "
+    "the harmonics of what they leave out.",
     "envmap harmonics": "Irradiance in spherical harmonics, with its error.",
     "envmap prefilter": "The map blurred by the GGX lobe, for real-time engines.",
     "calibrate pose": "Where the photograph was taken from, by four points on the floor.",
