@@ -9,7 +9,7 @@ far away as `FAR` radii, which is the ideal mirror ball.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -29,12 +29,14 @@ class BallCamera:
 
     Directions are in the axes of `camera` (x right, y down, z forward), of an environment at
     infinity. ``middle`` (3,) unit, towards the ball; ``distance`` of the ball's middle, in its
-    radii. The ball hides a cone of asin(1 / distance) about `middle` behind it.
+    radii. The ball hides a cone of asin(1 / distance) about `middle` behind it. ``corner`` is
+    the photograph's pixel that is (0, 0) here, for a picture that was cut out.
     """
 
     camera: CameraModel
     middle: Array
     distance: float
+    corner: tuple[int, int] = (0, 0)
 
     @property
     def hidden(self) -> float:
@@ -55,11 +57,29 @@ class BallCamera:
         normal = -np.cos(beta)[..., None] * self.middle + np.sin(beta)[..., None] * u
         pixels = self.camera.project(self.distance * self.middle + normal)
         pixels[~seen] = np.nan
-        return pixels
+        return pixels - self.corner
+
+    def outline(self, count: int = 256) -> Array:
+        """Points around the ball's outline, (count, 2) pixels."""
+        phi = np.linspace(0, 2 * math.pi, count, endpoint=False)[:, None]
+        side = np.linalg.svd(self.middle[None])[2][1:]
+        reach = math.tan(self.hidden)
+        rim = self.middle + reach * (np.cos(phi) * side[0] + np.sin(phi) * side[1])
+        return self.camera.project(rim) - self.corner
+
+    def cut_out(self) -> tuple[BallCamera, tuple[slice, slice]]:
+        """The same of the picture's part that holds the ball, and that part (rows, columns)."""
+        rim = self.outline()
+        width, height = self.camera.size
+        low = np.clip(np.floor(rim.min(axis=0)) - 1, 0, None).astype(int)
+        high = np.minimum(np.ceil(rim.max(axis=0)) + 2, (width, height)).astype(int)
+        corner = (self.corner[0] + int(low[0]), self.corner[1] + int(low[1]))
+        part = np.s_[int(low[1]) : int(high[1]), int(low[0]) : int(high[0])]
+        return replace(self, corner=corner), part
 
     def unproject(self, pixels: ArrayLike) -> Array:
         """Pixels to reflected unit directions, ``(..., 2) -> (..., 3)``; NaN off the ball."""
-        ray = self.camera.unproject(pixels)
+        ray = self.camera.unproject(np.asarray(pixels, float) + self.corner)
         ahead = ray @ self.middle
         # distance of the ray from the middle, squared, without cancellation for far balls
         off = ray - ahead[..., None] * self.middle

@@ -1,37 +1,50 @@
-"""Shots of a fisheye probe to one lat-long in world axes (seeds.md P15b)."""
+"""Shots of a light probe to one lat-long in world axes (seeds.md P14b, P15b).
+
+A shot is a fisheye's picture or a photograph of a mirror ball. Where several see, they are
+blended by weights that fall to nothing at the rim, and at the photographer's reflection.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from chromeball.envmap.mapping import LatLong, Mapping, Radial, of_camera
-from chromeball.envmap.resample import warp
-from chromeball.scene.camera import WORLD_FROM_LATLONG, CameraModel
+from chromeball.envmap.ball import BallCamera
+from chromeball.envmap.mapping import LatLong, Lens, Mapping, Radial
+from chromeball.envmap.refine import Refined, refine_turns
+from chromeball.envmap.resample import Warped, warp
+from chromeball.scene.camera import WORLD_FROM_LATLONG
 from chromeball.scene.color import luminance
 from chromeball.scene.errors import UserError
 
 type Array = NDArray[np.float64]
+
+_REFINE_WIDTH = 1024
+_MIN_WEIGHT = 1e-6  # up to the rim: what one shot alone sees is used whole
+_FADE = 1.3  # the photographer's cone ends softly, over this times its angle
 
 
 @dataclass(frozen=True)
 class Shot:
     """One radiance picture of the probe.
 
-    ``radiance`` (H, W, 3) float32; ``valid`` (H, W) or None; ``yaw`` about the vertical,
-    right-handed, ``pitch`` up and ``roll`` clockwise, radians.
+    ``radiance`` (H, W, 3) float32; ``mapping`` its pixels' directions in camera axes;
+    ``valid`` (H, W) or None; ``yaw`` about the vertical, right-handed, ``pitch`` up and
+    ``roll`` clockwise, radians. ``photographer``: half angle of the cone about the direction
+    back to a ball's camera that is not used, radians.
     """
 
     radiance: NDArray[np.float32]
-    camera: CameraModel
+    mapping: Mapping
     yaw: float = 0.0
     pitch: float = 0.0
     roll: float = 0.0
     valid: NDArray[np.bool_] | None = None
+    photographer: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -50,17 +63,14 @@ class Overlap:
 
 @dataclass(frozen=True)
 class Panorama:
-    """``radiance`` (H, W, 3) and ``alpha`` (H, W): the seen part of each pixel.
+    """``radiance`` (H, W, 3), black where unseen, and ``alpha`` (H, W), the seen part.
 
-    ``missing`` sr were not seen and are completed, ``completed_share`` of the map's energy
-    lies there. ``energy_error`` per shot: what resampling changed, relative.
+    ``energy_error`` per shot: what resampling changed, relative.
     """
 
     radiance: NDArray[np.float32]
     alpha: NDArray[np.float32]
     overlaps: tuple[Overlap, ...]
-    missing: float
-    completed_share: float
     energy_error: tuple[float, ...]
     hot_pixels: int
 
@@ -95,40 +105,29 @@ def world_from_shots(
     ]
 
 
-def vignetting_gain(camera: CameraModel, coefficients: Sequence[float]) -> Array:
-    """1 / (1 + c1 r^2 + c2 r^4 + ...), (H, W), r = 1 at the rim of the image circle.
+def refined(
+    shots: Sequence[Shot], rotations: Sequence[Array], width: int, fixed: int = 0
+) -> tuple[list[Array], Refined]:
+    """`rotations` (world_from_shot) improved by what the shots see together.
 
-    Raises
-    ------
-    UserError
-        When the lens has no image circle or the fall-off is not positive inside it.
-
+    Shot `fixed` keeps its place. Works on maps of `width`, 1024 at most.
     """
-    mapping = of_camera(camera)
-    if not isinstance(mapping, Radial):
-        raise UserError(f"vignetting is measured on an image circle; {camera.model} has none")
-    polynomial = np.polynomial.Polynomial([1.0, *coefficients])
-    if not (polynomial(np.linspace(0, 1, 1001)) > 0.01).all():
-        raise UserError("the vignetting falls below 1 % inside the image circle: check c1, c2")
-    width, height = camera.size
-    x = (np.arange(width) - mapping.centre[0]) / (mapping.focal[0] * mapping.rim)
-    y = (np.arange(height) - mapping.centre[1]) / (mapping.focal[1] * mapping.rim)
-    r2 = np.minimum(x[None, :] ** 2 + y[:, None] ** 2, 1.0)
-    return 1 / polynomial(r2)
+    target = LatLong((min(width, _REFINE_WIDTH), min(width, _REFINE_WIDTH) // 2))
+    world = target.directions()
+    lights: list[NDArray[np.float32]] = []
+    weights: list[NDArray[np.float32]] = []
+    for shot, turn in zip(shots, rotations, strict=True):
+        placed = _placed(shot, turn, target)
+        weight = shot_weight(shot, turn, world) * (placed.coverage > 0.999)
+        lights.append(luminance(placed.radiance).astype(np.float32))
+        weights.append((weight * (weight > 10 * _MIN_WEIGHT)).astype(np.float32))
+    found = refine_turns(lights, weights)
+    back = found.turns[fixed].T
+    return [back @ t @ r for t, r in zip(found.turns, rotations, strict=True)], found
 
 
-def combine(
-    shots: Sequence[Shot],
-    rotations: Sequence[Array],
-    width: int,
-    vignetting: Sequence[float] = (),
-) -> Panorama:
-    """All shots in one lat-long of `width`, blended by cos^2 weights that end at the rim.
-
-    `rotations` are world_from_shot (3, 3). Directions that no shot sees get the median
-    radiance of the seen part's border in the same elevation band: a lamp that touches the
-    border is not smeared around the back.
-    """
+def combine(shots: Sequence[Shot], rotations: Sequence[Array], width: int) -> Panorama:
+    """All shots in one lat-long of `width`; `rotations` are world_from_shot (3, 3)."""
     target = LatLong((width, width // 2))
     solid = target.solid_angles()
     world = target.directions()
@@ -139,37 +138,50 @@ def combine(
     errors: list[float] = []
     hot = 0
     for shot, turn in zip(shots, rotations, strict=True):
-        source = of_camera(shot.camera).turned(turn)
-        radiance = shot.radiance
-        if vignetting:
-            gain = vignetting_gain(shot.camera, vignetting).astype(np.float32)
-            radiance = radiance * gain[..., None]
-        result = warp(radiance, source, target, valid=shot.valid)
+        result = _placed(shot, turn, target)
         seeable = float((result.source_energy - result.outside).sum())
         errors.append(float(result.energy.sum()) / seeable - 1 if seeable > 0 else 0.0)
         hot += result.hot_pixels
-        weight = rim_weight(source, world) * result.coverage
+        weight = shot_weight(shot, turn, world) * result.coverage
         total += weight[..., None] * result.radiance
         weights += weight
-        alpha = np.maximum(alpha, result.coverage)
+        alpha = np.maximum(alpha, np.where(weight > 0, result.coverage, 0))
         inner = (result.coverage > 0.999) & (weight > 5e-4)  # to 98.5 % of the rim
         if len(shots) > 1:
             seen.append((luminance(result.radiance).astype(np.float32), inner))
     known = weights > 0
     total[known] /= weights[known][:, None]
-    alpha[~known] = 0
-    missing = alpha == 0
-    complete(total, missing)
-    energy = luminance(total) * solid
     return Panorama(
         radiance=total,
         alpha=alpha,
         overlaps=_overlaps(seen, solid),
-        missing=float((solid * (1 - alpha)).sum()),
-        completed_share=float(energy[missing].sum() / max(energy.sum(), 1e-300)),
         energy_error=tuple(errors),
         hot_pixels=hot,
     )
+
+
+def _placed(shot: Shot, world_from_shot: Array, target: Mapping) -> Warped:
+    # by `rotation`: a turned mapping would make its tables anew
+    turn = world_from_shot @ shot.mapping.rotation.T
+    return warp(shot.radiance, shot.mapping, target, rotation=turn, valid=shot.valid)
+
+
+def shot_weight(shot: Shot, world_from_shot: Array, world: Array) -> NDArray[np.float32]:
+    """How far a shot is trusted in each direction, (H, W); 0 where it must not be used.
+
+    A fisheye by cos^2 of the way from its axis to its rim, a ball by cos^2(theta / 2) of the
+    angle theta to its camera, where its picture is stretched by 1 / cos(theta / 2).
+    """
+    ball = shot.mapping.camera if isinstance(shot.mapping, Lens) else None
+    if isinstance(ball, BallCamera):
+        towards_camera = world_from_shot @ -ball.middle
+        theta = np.arccos(np.clip(world @ towards_camera, -1, 1))
+        weight = np.cos(np.minimum(theta, math.pi) / 2) ** 2 + _MIN_WEIGHT
+        if shot.photographer > 0:
+            fade = np.clip((theta / shot.photographer - 1) / (_FADE - 1), 0, 1)
+            weight = weight * fade * fade * (3 - 2 * fade)
+        return weight.astype(np.float32)
+    return rim_weight(shot.mapping.turned(world_from_shot), world)
 
 
 def rim_weight(source: Mapping, world: Array) -> NDArray[np.float32]:
@@ -181,44 +193,61 @@ def rim_weight(source: Mapping, world: Array) -> NDArray[np.float32]:
         half = np.array(source.size) / 2
         way = np.abs(source.pixels_of(world) - (half - 0.5)) / half
         way = np.nan_to_num(way, nan=1.0).max(axis=-1)
-    return (np.cos(np.minimum(way, 1) * math.pi / 2) ** 2 + 1e-6).astype(np.float32)
+    return (np.cos(np.minimum(way, 1) * math.pi / 2) ** 2 + _MIN_WEIGHT).astype(np.float32)
 
 
-def complete(radiance: NDArray[np.float32], missing: NDArray[np.bool_]) -> None:
-    """Fill `missing` (H, W) in place, from the border of the rest, band by band.
+def without_vignetting(shot: Shot, coefficients: Sequence[float]) -> Shot:
+    """The shot divided by 1 + c1 r^2 + c2 r^4 + ..., r = 1 at the rim of its image circle.
 
-    The border lies 1.5 to 6 degrees inside, where no fringe of the lens' rim reaches; a band
-    is 15 degrees up and down, so that a window at the border is outvoted by the walls.
+    Raises
+    ------
+    UserError
+        When the lens has no image circle or the fall-off is not positive inside it.
+
     """
-    import cv2
+    gain = vignetting_gain(shot.mapping, coefficients).astype(np.float32)
+    return replace(shot, radiance=shot.radiance * gain[..., None])
 
-    if not missing.any() or missing.all():
-        return
-    height, width = missing.shape
-    degree = width / 360
 
-    def near(degrees: float) -> NDArray[np.bool_]:
-        reach = max(1, round(degrees * degree))
-        wide = np.pad(missing.astype(np.uint8), ((0, 0), (reach, reach)), mode="wrap")
-        kernel = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
-        return np.asarray(cv2.dilate(wide, kernel))[:, reach:-reach] > 0
+def vignetting_gain(mapping: Mapping, coefficients: Sequence[float]) -> Array:
+    """1 / (1 + c1 r^2 + c2 r^4 + ...), (H, W), r = 1 at the rim of the image circle.
 
-    border = near(6.0) & ~near(1.5)
-    if not border.any():
-        border = ~missing
-    rows = np.nonzero(border.any(axis=1))[0]
-    half = max(1, round(15 * degree))
-    bands = np.zeros((height, 3))
-    step = max(1, half // 8)
-    heights = np.arange(0, height + step, step)
-    knots = np.zeros((len(heights), 3))
-    for k, y in enumerate(heights):
-        middle = int(rows[np.argmin(np.abs(rows - y))])
-        band = np.s_[max(middle - half, 0) : middle + half + 1]
-        knots[k] = np.median(radiance[band][border[band]], axis=0)
-    for c in range(3):
-        bands[:, c] = np.interp(np.arange(height), heights, knots[:, c])
-    radiance[missing] = bands[np.nonzero(missing)[0]]
+    Raises
+    ------
+    UserError
+        When the lens has no image circle or the fall-off is not positive inside it.
+
+    """
+    if not isinstance(mapping, Radial):
+        raise UserError("vignetting is measured on an image circle; this lens has none")
+    polynomial = np.polynomial.Polynomial([1.0, *coefficients])
+    if not (polynomial(np.linspace(0, 1, 1001)) > 0.01).all():
+        raise UserError("the vignetting falls below 1 % inside the image circle: check c1, c2")
+    width, height = mapping.size
+    x = (np.arange(width) - mapping.centre[0]) / (mapping.focal[0] * mapping.rim)
+    y = (np.arange(height) - mapping.centre[1]) / (mapping.focal[1] * mapping.rim)
+    r2 = np.minimum(x[None, :] ** 2 + y[:, None] ** 2, 1.0)
+    return 1 / polynomial(r2)
+
+
+def trimmed(shot: Shot, angle: float) -> Shot:
+    """Without the outermost `angle` radians of the image circle, where its edge is soft.
+
+    Raises
+    ------
+    UserError
+        When the lens has no image circle, or nothing would be left of it.
+
+    """
+    mapping = shot.mapping
+    if not isinstance(mapping, Radial):
+        raise UserError("only an image circle can be trimmed; this lens has none")
+    if not 0 <= angle < mapping.max_angle / 2:
+        raise UserError(
+            f"a circle of {math.degrees(mapping.max_angle):.0f} degrees from axis "
+            f"to rim cannot lose {math.degrees(angle):.0f}"
+        )
+    return replace(shot, mapping=replace(mapping, max_angle=mapping.max_angle - angle))
 
 
 def _overlaps(

@@ -1,8 +1,9 @@
-"""Turns of overlapping shots from what they see together (Lucas and Kanade 1981, on the sphere).
+"""Turns of overlapping shots from what they see together: Lucas and Kanade 1981, on a sphere.
 
-Each shot comes as a lat-long map of its own, placed by its nominal direction. What is compared
-is local contrast of log luminance, so that vignetting, flare and a passing cloud do not count;
-coarse to fine, Gauss-Newton with Tukey's weights over all pairs at once. Shot 0 stays.
+Each shot comes as a lat-long map of its own, placed by its nominal direction. A search over
+turns compares local contrast of log luminance. Gauss-Newton, coarse to fine, with Tukey's
+weights over all pairs at once, ends on log luminance itself, with a smooth ratio of each pair
+(harmonics of order 2: exposure, vignetting, flare) solved for besides. Shot 0 stays.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from chromeball.envmap.lights import sh_basis
 from chromeball.envmap.mapping import LatLong
 from chromeball.scene.pose import Pose
 
@@ -38,8 +40,8 @@ class Refined:
 
     ``turns`` (N, 3, 3): what a shot shows at d in its nominal place is at ``turns[n] @ d``.
     ``angles`` (N,) their sizes and ``sigma`` (N,) standard errors of a turn about the worst
-    axis, radians; ``correlation`` of local contrast in the overlaps before and after. ``reason``
-    says why nothing was changed, or is empty.
+    axis, radians; ``correlation`` of local contrast in the overlaps before and after.
+    ``reason`` says why nothing was changed, or is empty.
     """
 
     turns: Array
@@ -66,9 +68,11 @@ def refine_turns(luminances: Sequence[Plane], weights: Sequence[Plane]) -> Refin
     for size in reversed(sizes):
         problem = _Problem.of(luminances, weights, size)
         turns = problem.solve(turns)
+    whole = _Problem.of(luminances, weights, width, local=False)
+    turns = whole.solve(turns)
     still = np.stack([np.eye(3)] * count)
     before, after = problem.correlation(still), problem.correlation(turns)
-    sigma = problem.sigma(turns)
+    sigma = whole.sigma(turns)
     angles = np.array(
         [np.linalg.norm(Pose(turn, np.zeros(3)).rotation_vector()) for turn in turns]
     )
@@ -98,17 +102,18 @@ def _kept(
 
 @dataclass(frozen=True)
 class _Layer:
-    """A shot at one size: contrast (H, W), its turning gradient d x grad s, and weights."""
+    """A shot at one size: a signal s (H, W), its turning gradient d x grad s, and weights."""
 
-    contrast: Plane
+    signal: Plane
     gradient: Plane
     weight: Plane
 
 
 @dataclass(frozen=True)
 class _Views:
-    """All shots in M directions: solid angles, blocks, and contrast, gradient, weight each."""
+    """All shots in M directions: solid angles, blocks, and signal, gradient, weight each."""
 
+    directions: Array
     solid: Array
     blocks: NDArray[np.int64]
     sampled: tuple[tuple[Array, Array, Array], ...]
@@ -121,6 +126,7 @@ class _Problem:
     solid: Array
     layers: tuple[_Layer, ...]
     pairs: tuple[tuple[int, int], ...]
+    local: bool
 
     @cached_property
     def grown(self) -> list[Plane]:
@@ -137,17 +143,24 @@ class _Problem:
     def fields(self) -> list[Plane]:
         """All that is sampled, with two columns beyond each seam."""
         return [
-            np.ascontiguousarray(_wrapped(np.dstack([s.contrast, s.gradient, s.weight]), 2))
+            np.ascontiguousarray(_wrapped(np.dstack([s.signal, s.gradient, s.weight]), 2))
             for s in self.layers
         ]
 
     @classmethod
-    def of(cls, luminances: Sequence[Plane], weights: Sequence[Plane], width: int) -> _Problem:
+    def of(
+        cls,
+        luminances: Sequence[Plane],
+        weights: Sequence[Plane],
+        width: int,
+        local: bool = True,
+    ) -> _Problem:
+        """Of local contrast, or of log luminance with smooth ratios to be solved for."""
         mapping = LatLong((width, width // 2))
         d = mapping.directions()
         solid = mapping.solid_angles()
         layers = tuple(
-            _layer(luminance, weight, d, width)
+            _layer(luminance, weight, d, width, local)
             for luminance, weight in zip(luminances, weights, strict=True)
         )
         pairs: list[tuple[int, int]] = []
@@ -156,7 +169,7 @@ class _Problem:
                 both = (layers[i].weight > 0) & (layers[j].weight > 0)
                 if solid[both].sum() > 0.01:
                     pairs.append((i, j))
-        return cls(width, d, solid, layers, tuple(pairs))
+        return cls(width, d, solid, layers, tuple(pairs), local)
 
     def views(self, turns: Array) -> _Views:
         """All shots as turned, where two or more see."""
@@ -167,7 +180,7 @@ class _Problem:
         y, x = np.divmod(active, self.width)
         block = max(1, round(_BLOCK * self.width / (2 * math.pi)))
         blocks = (y // block) * (self.width // block + 1) + x // block
-        return _Views(self.solid.reshape(-1)[active], blocks, tuple(sampled))
+        return _Views(d, self.solid.reshape(-1)[active], blocks, tuple(sampled))
 
     def _seen(self, k: int, turn: Array) -> NDArray[np.bool_]:
         """Where shot k may have weight, at a quarter of the size and then grown."""
@@ -177,7 +190,7 @@ class _Problem:
         return np.repeat(np.repeat(seen, 4, axis=0), 4, axis=1)[:height, : self.width] > 0
 
     def _sampled(self, k: int, turn: Array, d: Array) -> tuple[Array, Array, Array]:
-        """Contrast, gradient and weight of shot k as turned, in directions d (M, 3)."""
+        """Signal, gradient and weight of shot k as turned, in directions d (M, 3)."""
         import cv2
 
         x, y = self._pixels(d @ turn)
@@ -185,7 +198,7 @@ class _Problem:
         rows[0, : len(d)], rows[1, : len(d)] = x + 2, y
         x, y = rows.reshape(2, -1, 1024)
         got = cv2.remap(self.fields[k], x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        got = np.asarray(got, float).reshape(-1, 5)[: len(d)]
+        got = np.asarray(got, np.float64).reshape(-1, 5)[: len(d)]
         # the gradient was taken in the map's own axes
         return got[:, 0], got[:, 1:4] @ turn.T, got[:, 4]
 
@@ -223,17 +236,15 @@ class _Problem:
             -1, 3
         )
         mine, other = self.layers[i], self.layers[k]
-        a, b = (np.clip(_blur(layer.contrast, 1.5), -0.5, 0.5) for layer in (mine, other))
+        a, b = (np.clip(_blur(layer.signal, 1.5), -0.5, 0.5) for layer in (mine, other))
         near = other.weight > 0
         for vector in vectors[np.abs(vectors).min(axis=1) > _REACH - _STEP / 2]:
             near |= self._nearest(other.weight, self.directions @ _turn(vector)) > 0
         usable = np.flatnonzero(near & (mine.weight > 0))
         usable = np.random.default_rng(0).permutation(usable)[:_SAMPLES]
-        d, a, solid, nominal = (
-            field.reshape(-1, *field.shape[2:])[usable]
-            for field in (self.directions, a, self.solid, other.weight)
-        )
-        least = 0.3 * float(solid[nominal > 0].sum())
+        d = self.directions.reshape(-1, 3)[usable]
+        a, solid = a.reshape(-1)[usable], self.solid.reshape(-1)[usable]
+        least = 0.3 * float(solid[other.weight.reshape(-1)[usable] > 0].sum())
         scores = np.full(len(vectors), -1.0)
         for n, vector in enumerate(vectors):
             there = d @ _turn(vector)
@@ -284,7 +295,7 @@ class _Problem:
         return turns
 
     def _normal(self, turns: Array, scatter: bool = False) -> tuple[Array, Array, Array]:
-        """Normal equations over the turns of shots 1.., and on request the sandwich's middle."""
+        """Normal equations over the turns of shots 1..; on request the sandwich's middle."""
         n = len(turns)
         normal, right = np.zeros((3 * n, 3 * n)), np.zeros(3 * n)
         middle = np.zeros((3 * n, 3 * n))
@@ -301,6 +312,15 @@ class _Problem:
             scale = 1.4826 * np.median(np.abs(r)) + 1e-9
             tukey = np.clip(1 - (r / (4.685 * scale)) ** 2, 0, None) ** 2
             weight = w[used] * tukey
+            if not self.local:
+                # variable projection: what a smooth ratio explains is taken out of both
+                smooth = sh_basis(views.directions[used])
+                both = np.column_stack([r, jacobian])
+                gram = smooth.T @ (smooth * weight[:, None])
+                gram += 1e-9 * np.trace(gram) * np.eye(len(gram))
+                fit = np.linalg.solve(gram, smooth.T @ (both * weight[:, None]))
+                both -= smooth @ fit
+                r, jacobian = both[:, 0], both[:, 1:]
             here = np.r_[3 * i : 3 * i + 3, 3 * j : 3 * j + 3]
             weighted = jacobian * weight[:, None]
             normal[np.ix_(here, here)] += weighted.T @ jacobian
@@ -354,7 +374,7 @@ class _Problem:
         return ab / math.sqrt(aa * bb) if aa > 0 and bb > 0 else 0.0
 
 
-def _layer(luminance: Plane, weight: Plane, d: Array, width: int) -> _Layer:
+def _layer(luminance: Plane, weight: Plane, d: Array, width: int, local: bool) -> _Layer:
     import cv2
 
     size = (width, width // 2)
@@ -363,16 +383,18 @@ def _layer(luminance: Plane, weight: Plane, d: Array, width: int) -> _Layer:
     floor = 1e-3 * float(np.median(positive)) if positive.size else 1.0
     share = cv2.resize(seen, size, interpolation=cv2.INTER_AREA)
     mean = cv2.resize(luminance * seen, size, interpolation=cv2.INTER_AREA)
-    log = np.log(np.maximum(mean / np.maximum(share, 1e-6), 0) + max(floor, 1e-30))
-    inside = (share > 0.999).astype(np.float32)
-    inside = np.asarray(cv2.erode(_wrapped(inside, 2), np.ones((3, 3), np.uint8)))[:, 2:-2]
-    # local contrast: less the mean over some 6 pixels, the seen ones alone
-    low = _blur(log * inside, 3.0) / np.maximum(_blur(inside, 3.0), 1e-3)
-    contrast = _blur((log - low) * inside, 0.7)
-    contrast *= inside
-    down, right = _derivatives(contrast)
-    edge = np.asarray(cv2.erode(_wrapped(inside, 4), np.ones((5, 5), np.uint8)))[:, 4:-4]
-    edge *= np.asarray(cv2.resize(weight, size, interpolation=cv2.INTER_AREA))
+    level = np.maximum(mean / np.maximum(share, 1e-6), 0) + max(floor, 1e-30)
+    log = np.log(level).astype(np.float32)
+    inside = _shrunk((share > 0.999).astype(np.float32), 1)
+    if local:  # less the mean over some 6 pixels, the seen ones alone
+        around = _blur(log * inside, 3.0) / np.maximum(_blur(inside, 3.0), np.float32(1e-3))
+        log = np.asarray(log - around, np.float32)
+    share = np.maximum(_blur(inside, 0.7), np.float32(1e-3))
+    signal = np.asarray(_blur(np.asarray(log * inside, np.float32), 0.7) / share * inside)
+    down, right = _derivatives(signal)
+    edge = _shrunk(inside, 2) * np.asarray(
+        cv2.resize(weight, size, interpolation=cv2.INTER_AREA)
+    )
     # grad s on the sphere: image right and down are unit tangents times cos lat and 1
     east = np.stack([-d[..., 2], np.zeros(d.shape[:2]), d[..., 0]], axis=-1)
     cosine = np.linalg.norm(east, axis=-1)
@@ -383,11 +405,22 @@ def _layer(luminance: Plane, weight: Plane, d: Array, width: int) -> _Layer:
     slope = slope + (down * radian)[..., None] * south
     edge = np.where(cosine > 0.05, edge, 0)  # the poles' rows have no gradient of their own
     gradient = np.cross(d, slope)
-    return _Layer(contrast, gradient.astype(np.float32), edge.astype(np.float32))
+    return _Layer(
+        signal.astype(np.float32), gradient.astype(np.float32), edge.astype(np.float32)
+    )
 
 
 def _wrapped(plane: Plane, pad: int) -> Plane:
     return np.concatenate([plane[:, -pad:], plane, plane[:, :pad]], axis=1)
+
+
+def _shrunk(plane: Plane, pixels: int) -> Plane:
+    """A mask without its outermost pixels."""
+    import cv2
+
+    kernel = np.ones((2 * pixels + 1, 2 * pixels + 1), np.uint8)
+    wide = cv2.erode(_wrapped(plane, 2 * pixels), kernel)
+    return np.asarray(wide, np.float32)[:, 2 * pixels : -2 * pixels]
 
 
 def _blur(plane: Plane, sigma: float) -> Plane:

@@ -205,12 +205,7 @@ def backdrop(scene: Scene, folder: Path, view: View, origin: NDArray[np.float64]
             later = virtual_camera(view_at(view, view.shutter), origin)
             closing = later.world_from_camera
         return Backdrop(virtual_camera(view, origin), closing=closing)
-    build = folder / scene.folder
-    plate_file = build / f"{view.bracket}.exr" if view.bracket else folder / str(view.plate)
-    # posed by four points, or a file that holds the pose
-    camera_file = build / f"{view.name}.cameramodel"
-    if view.camera and not view.points:
-        camera_file = folder / view.camera
+    plate_file, camera_file = (folder / name for name in scene.photograph_of(view))
     plate = read_rgb(plate_file)
     camera = CameraModel.read(camera_file)
     if camera.size != (plate.shape[1], plate.shape[0]):

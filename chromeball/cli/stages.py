@@ -18,7 +18,7 @@ import msgspec
 
 from chromeball.renderer.inputs import scene_inputs
 from chromeball.scene.errors import UserError
-from chromeball.scene.manifest import Bracket, Lens, Meter, Quad, Scene, View
+from chromeball.scene.manifest import Bracket, Lens, Meter, Probe, Quad, Scene, View
 from chromeball.scene.sequence import at, frames_of, moves
 
 # the suffixes of `chromeball.scene.image`, which is too heavy to import for a plan
@@ -119,8 +119,9 @@ class _Planner:
         metered = scene.hdr.meter.bracket if scene.hdr.meter else None
         first = sorted(scene.bracket, key=lambda bracket: bracket.name != metered)
         plan += [self._merge(bracket) for bracket in first]
-        plan += [self._lens(), self._align(), self._probe()]
+        plan += [self._lens(), self._align()]
         plan += [self._pose(view) for view in scene.view]
+        plan.append(self._probe())
         plan += self._stand_in()
         plan.append(self._lights())
         for view in scene.view:
@@ -141,8 +142,7 @@ class _Planner:
         if scene.probe and not scene.env.file:
             if not scene.probe.shot:
                 raise UserError("[probe] has no shot")
-            if (scene.probe.lens is None) == (scene.probe.camera is None):
-                raise UserError("[probe] needs a lens or a camera, one of the two")
+            _check_probe(scene.probe)
         if scene.align:
             shots = [shot.bracket for shot in self.shots]
             known = ["env"] if scene.env.file else shots
@@ -489,7 +489,7 @@ class _Planner:
         if probe and probe.camera and align.picture != "env":
             inputs.append(probe.camera)
         clicked = {
-            "lens": probe and probe.lens,
+            "lens": probe and [probe.lens, *(shot.lens for shot in probe.shot)],
             "camera": probe and probe.camera,
             "shot": [shot for shot in self.shots if shot.bracket == align.picture],
         }
@@ -530,10 +530,29 @@ class _Planner:
         if probe.camera:
             options += _option("camera", probe.camera)
             inputs.append(probe.camera)
-        elif probe.lens:
-            options += _option("lens", lens_text(probe.lens))
+        elif lenses := [shot.lens or probe.lens for shot in probe.shot if not shot.ball]:
+            same = all(lens == lenses[0] for lens in lenses)
+            texts = [lens_text(lens) for lens in lenses if lens]
+            options += _option("lens", texts[0] if same and texts else " ".join(texts))
+        if balls := [shot.ball for shot in probe.shot if shot.ball]:
+            options += _option("ball", " ".join(_numbers(ball) for ball in balls))
+            options += _option("photographer", f"{probe.photographer:.10g}")
+            options += _option("reflectance", _numbers(probe.reflectance))
         if probe.vignetting:
             options += _option("vignetting", ",".join(repr(c) for c in probe.vignetting))
+        if probe.trim:
+            options += _option("trim", f"{probe.trim:.10g}")
+        if masks := [shot.mask for shot in probe.shot if shot.mask]:
+            options += ["--mask", *masks]
+            inputs += masks
+        if not probe.refine and len(merged) > 1:
+            options.append("--no-refine")
+        if scene.env.ground:
+            options += _option("ground", _numbers(scene.env.ground))
+        if scene.env.fill:
+            photograph = scene.photograph_of(scene.find_view(scene.env.fill))
+            options += _option("fill", ":".join(photograph))
+            inputs += photograph
         if scene.align:
             options += _option("align", f"{self.build}/align.json")
             inputs.append(f"{self.build}/align.json")
@@ -656,12 +675,8 @@ class _Planner:
         inputs = [self._env()]
         if scene.stand_in:
             inputs.append(f"{self.build}/stand_in.ply")
-        if view.bracket:
-            inputs.append(f"{self.build}/{view.bracket}.exr")
-        if view.plate:
-            inputs.append(view.plate)
-        if view.points and (view.bracket or view.plate):
-            inputs.append(f"{self.build}/{view.name}.cameramodel")
+        if view.bracket or view.plate:
+            inputs += scene.photograph_of(view)
         elif view.camera:
             inputs.append(view.camera)
         if view.closing_camera:
@@ -711,6 +726,24 @@ class _Planner:
         )
 
 
+def _check_probe(probe: Probe) -> None:
+    balls = [shot.ball is not None for shot in probe.shot]
+    if any(balls) != all(balls):
+        raise UserError("[probe]: either all shots are of a ball, or none is")
+    masks = [shot.mask is not None for shot in probe.shot]
+    if any(masks) != all(masks):
+        raise UserError("[probe]: either all shots have a mask, or none has")
+    own = [shot.lens is not None for shot in probe.shot]
+    if any(balls):
+        if probe.lens or any(own):
+            raise UserError("[probe]: shots of a ball have a camera, or none, but no lens")
+    elif probe.camera is not None:
+        if probe.lens or any(own):
+            raise UserError("[probe] needs a lens or a camera, one of the two")
+    elif probe.lens is None and not all(own):
+        raise UserError("[probe] needs a lens or a camera, one of the two")
+
+
 def lens_text(lens: Lens) -> str:
     """``equisolid:190``, or ``equisolid:186:2825,1863.5,1806`` with centre and radius."""
     text = f"{lens.model}:{lens.fov:.10g}"
@@ -719,6 +752,10 @@ def lens_text(lens: Lens) -> str:
     centre = "," if lens.centre is None else ",".join(f"{v:.10g}" for v in lens.centre)
     radius = "" if lens.radius is None else f"{lens.radius:.10g}"
     return f"{text}:{centre},{radius}"
+
+
+def _numbers(values: Sequence[float]) -> str:
+    return ",".join(f"{value:.10g}" for value in values)
 
 
 def points_text(points: Quad) -> str:

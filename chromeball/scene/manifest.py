@@ -113,25 +113,41 @@ class Lens(Table, frozen=True):
 
 
 class Shot(Table, frozen=True):
-    """One direction of the light probe: its bracket and its turn about the vertical."""
+    """One direction of the light probe: its bracket and its turn about the vertical.
+
+    ``ball``: centre and radius of a mirror ball's outline in the picture, pixels; then yaw is
+    where its camera looks. ``lens``: where it is not the probe's. ``mask``: a picture, white
+    where this one may be used.
+    """
 
     bracket: Name
     yaw: float = 0.0
     pitch: float = 0.0
     roll: float = 0.0
+    ball: tuple[float, float, Positive] | None = None
+    lens: Lens | None = None
+    mask: str | None = None
 
 
 class Probe(Table, frozen=True):
     """The light probe: shots with one lens, a model of it or a ``camera`` file.
 
     ``vignetting``: c1, c2, ... of the fall-off 1 + c1 r^2 + c2 r^4 + ..., r = 1 at the rim of
-    the image circle; measured values are divided by it.
+    the image circle; measured values are divided by it. ``trim``: degrees at the rim of the
+    circle that are left out. ``refine``: turn the shots from what they see together.
+    Of mirror balls: ``camera`` is the one that photographed them (far away without),
+    ``reflectance`` is divided by, and ``photographer`` degrees about the direction to the
+    camera are left out.
     """
 
     shot: list[Shot]
     lens: Lens | None = None
     camera: str | None = None
     vignetting: list[float] = []
+    trim: Annotated[float, Meta(ge=0)] = 0.0
+    refine: bool = True
+    reflectance: Vector = (1.0, 1.0, 1.0)
+    photographer: Annotated[float, Meta(ge=0, lt=120)] = 20.0
 
 
 class Align(Table, frozen=True):
@@ -153,12 +169,16 @@ class Align(Table, frozen=True):
 class Env(Table, frozen=True):
     """The lat-long map. ``file``: a finished panorama, so that nothing is stitched.
 
-    ``lights``: how many light samples `envmap lights` writes.
+    ``lights``: how many light samples `envmap lights` writes. What no shot saw is completed
+    from the plate of the view ``fill``, as matt ground of reflectance ``ground``, or from the
+    border of what was seen.
     """
 
     width: Annotated[int, Meta(ge=16, le=32768)] = 1024
     file: str | None = None
     lights: Annotated[int, Meta(ge=1, le=65536)] = 64
+    ground: Vector | None = None
+    fill: Name | None = None
 
 
 class StandIn(Table, frozen=True):
@@ -579,6 +599,28 @@ class Scene(Table, frozen=True):
                 return bracket
         near = _nearest(name, [bracket.name for bracket in self.bracket])
         raise UserError(f"there is no [[bracket]] named {name!r}{near}")
+
+    def find_view(self, name: str) -> View:
+        """The view of that name, or a :class:`UserError`."""
+        for view in self.view:
+            if view.name == name:
+                return view
+        near = _nearest(name, [view.name for view in self.view])
+        raise UserError(f"there is no [[view]] named {name!r}{near}")
+
+    def photograph_of(self, view: View) -> tuple[str, str]:
+        """A view's photograph and the file with its camera and pose, relative to the scene.
+
+        Raises :class:`UserError` for a view without a photograph.
+        """
+        if not (view.bracket or view.plate):
+            raise UserError(f"view {view.name!r} has no photograph: no bracket, no plate")
+        build = self.folder.rstrip("/")
+        plate = f"{build}/{view.bracket}.exr" if view.bracket else str(view.plate)
+        # posed by four points, or a file that holds the pose
+        if view.camera and not view.points:
+            return plate, view.camera
+        return plate, f"{build}/{view.name}.cameramodel"
 
 
 def _check_scale(scale: float | tuple[float, float, float] | None) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import override
+from typing import Protocol, override, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,11 +21,24 @@ from chromeball.scene.errors import UserError
 _NODES = 512  # nodes a side of a face of an arbitrary lens's table
 
 
+@runtime_checkable
+class Projects(Protocol):
+    """Directions in camera axes to pixels and back: a camera, or a camera and a mirror."""
+
+    def project(self, directions: ArrayLike) -> Array:
+        """(..., 3) to (..., 2), NaN where unseen."""
+        ...
+
+    def unproject(self, pixels: ArrayLike) -> Array:
+        """(..., 2) to (..., 3) unit, NaN where nothing is seen."""
+        ...
+
+
 @dataclass(frozen=True, kw_only=True)
 class Lens(Mapping):
     """Any other camera, by its own projection."""
 
-    camera: CameraModel
+    camera: Projects
 
     @override
     def project(self, directions: ArrayLike) -> Array:

@@ -190,10 +190,13 @@ def _align_of_scene(path: Path) -> tuple[CameraModel, Align, Path | None, list[P
         return CameraModel.latlong(need_size(picture)), entry, picture, [path, picture]
     if scene.probe is None:
         raise UserError("there is no [probe]: nothing says through which lens", file=path)
-    if entry.picture not in [shot.bracket for shot in scene.probe.shot]:
+    shots = [shot for shot in scene.probe.shot if shot.bracket == entry.picture]
+    if not shots:
         raise UserError(f"align.picture {entry.picture!r} is no shot of the [probe]", file=path)
+    if shots[0].ball:
+        raise UserError("the corners must be clicked through a lens, not in a ball", file=path)
     picture = _picture_of(scene, entry.picture, root)
-    model = lens_of(scene.probe, need_size(picture), root, picture)
+    model = lens_of(scene.probe, shots[0], need_size(picture), root, picture)
     inputs = [path, picture]
     if scene.probe.camera:
         inputs.append(root / scene.probe.camera)

@@ -14,7 +14,7 @@ from chromeball.scene.errors import UserError
 if TYPE_CHECKING:
     from chromeball.envmap.mapping import Mapping
     from chromeball.scene.camera import CameraModel
-    from chromeball.scene.manifest import Probe
+    from chromeball.scene.manifest import Probe, Shot
 
 type Out = Annotated[Path, Parameter(name=["--output", "-o"])]
 type Json = Annotated[bool, Parameter(negative="")]
@@ -98,27 +98,29 @@ def source_fisheye(
 
 
 def lens_of(
-    probe: Probe, size: tuple[int, int], root: Path, picture: Path | None
+    probe: Probe, shot: Shot, size: tuple[int, int], root: Path, picture: Path | None
 ) -> CameraModel:
-    """The probe's camera as the scene file says."""
-    from chromeball.scene.camera import CameraModel
+    """The camera of a probe's shot as the scene file says."""
+    from chromeball.cli.stages import lens_text
+    from chromeball.envmap.mapping import parse_lens
 
-    if (probe.lens is None) == (probe.camera is None):
+    lens = shot.lens or probe.lens
+    if (lens is None) == (probe.camera is None):
         raise UserError("[probe] needs a lens or a camera, one of the two")
     if probe.camera is not None:
         return read_camera(root / probe.camera, size, picture)
-    assert probe.lens is not None
-    return CameraModel.fisheye(
-        probe.lens.model,
-        size,
-        math.radians(probe.lens.fov),
-        centre=probe.lens.centre,
-        radius=probe.lens.radius,
-    )
+    assert lens is not None
+    return parse_lens(lens_text(lens), size)
 
 
 def write_panorama(
-    stage: Any, output: Path, radiance: Any, alpha: Any, kept: dict[str, Any], origin: Any
+    stage: Any,
+    output: Path,
+    radiance: Any,
+    alpha: Any,
+    kept: dict[str, Any],
+    origin: Any,
+    completed: Any,
 ) -> None:
     """A lat-long map with alpha, its attributes and its preview."""
     import numpy as np
@@ -131,8 +133,8 @@ def write_panorama(
     with stage.output(output) as temporary:
         write_exr(
             temporary,
-            np.concatenate([radiance, alpha[..., None]], axis=2),
-            channels=("R", "G", "B", "A"),
+            np.dstack([radiance, alpha, completed]).astype(np.float32),
+            channels=("R", "G", "B", "A", "completed"),
             attributes=latlong_attributes(kept, origin),
         )
 
