@@ -106,13 +106,15 @@ def world_from_shots(
 
 
 def refined(
-    shots: Sequence[Shot], rotations: Sequence[Array], width: int, fixed: int = 0
+    shots: Sequence[Shot], rotations: Sequence[Array], fixed: int = 0
 ) -> tuple[list[Array], Refined]:
     """`rotations` (world_from_shot) improved by what the shots see together.
 
-    Shot `fixed` keeps its place. Works on maps of `width`, 1024 at most.
+    Shot `fixed` keeps its place. Works at the shots' own resolution, on maps of 1024 at most.
     """
-    target = LatLong((min(width, _REFINE_WIDTH), min(width, _REFINE_WIDTH) // 2))
+    finest = max(1 / math.sqrt(_pixel(shot.mapping)) for shot in shots)  # pixels a radian
+    width = min(_REFINE_WIDTH, max(128, 8 * round(2 * math.pi * finest / 8)))
+    target = LatLong((width, width // 2))
     world = target.directions()
     lights: list[NDArray[np.float32]] = []
     weights: list[NDArray[np.float32]] = []
@@ -158,6 +160,12 @@ def combine(shots: Sequence[Shot], rotations: Sequence[Array], width: int) -> Pa
         energy_error=tuple(errors),
         hot_pixels=hot,
     )
+
+
+def _pixel(mapping: Mapping) -> float:
+    """Solid angle of a typical pixel, sr."""
+    solid = mapping.solid_angles()
+    return float(np.median(solid[solid > 0]))
 
 
 def _placed(shot: Shot, world_from_shot: Array, target: Mapping) -> Warped:

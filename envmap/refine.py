@@ -16,7 +16,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from chromeball.envmap.lights import sh_basis
+from chromeball.envmap.harmonics import sh_basis
 from chromeball.envmap.mapping import LatLong
 from chromeball.scene.pose import Pose
 
@@ -30,6 +30,7 @@ _COARSEST = 360  # pixels across: of a ring 10 degrees wide some pixels remain
 _STEP, _REACH = math.radians(2), math.radians(12)  # the search's grid
 _SAMPLES = 5000
 _CANDIDATES = 16
+_CLEAR = 0.9  # correlation that needs no search
 _INTERPOLATION = 0.03  # pixels: what interpolation may pull an estimate by
 _BLOCK = math.radians(3)  # residuals nearer than this are not independent
 
@@ -64,7 +65,9 @@ def refine_turns(luminances: Sequence[Plane], weights: Sequence[Plane]) -> Refin
     problem = _Problem.of(luminances, weights, sizes[-1])
     if not problem.pairs:
         return _kept(count, "no two shots overlap")
-    turns = problem.search()
+    turns = problem.solve(np.stack([np.eye(3)] * count))
+    if problem.correlation(turns) < _CLEAR:
+        turns = problem.search()
     for size in reversed(sizes):
         problem = _Problem.of(luminances, weights, size)
         turns = problem.solve(turns)
@@ -390,7 +393,8 @@ def _layer(luminance: Plane, weight: Plane, d: Array, width: int, local: bool) -
         around = _blur(log * inside, 3.0) / np.maximum(_blur(inside, 3.0), np.float32(1e-3))
         log = np.asarray(log - around, np.float32)
     share = np.maximum(_blur(inside, 0.7), np.float32(1e-3))
-    signal = np.asarray(_blur(np.asarray(log * inside, np.float32), 0.7) / share * inside)
+    signal = _blur(np.asarray(log * inside, np.float32), 0.7) / share * inside
+    signal = np.asarray(signal, np.float32)
     down, right = _derivatives(signal)
     edge = _shrunk(inside, 2) * np.asarray(
         cv2.resize(weight, size, interpolation=cv2.INTER_AREA)

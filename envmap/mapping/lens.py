@@ -25,11 +25,11 @@ _NODES = 512  # nodes a side of a face of an arbitrary lens's table
 class Projects(Protocol):
     """Directions in camera axes to pixels and back: a camera, or a camera and a mirror."""
 
-    def project(self, directions: ArrayLike) -> Array:
+    def project(self, directions: ArrayLike, /) -> Array:
         """(..., 3) to (..., 2), NaN where unseen."""
         ...
 
-    def unproject(self, pixels: ArrayLike) -> Array:
+    def unproject(self, pixels: ArrayLike, /) -> Array:
         """(..., 2) to (..., 3) unit, NaN where nothing is seen."""
         ...
 

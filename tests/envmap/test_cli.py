@@ -81,7 +81,7 @@ def points_of(folder: Path) -> str:
 
 def check_panorama(path: Path) -> None:
     image = read_image(path)
-    assert image.channels == ("R", "G", "B", "A")
+    assert image.channels == ("R", "G", "B", "A", "completed")
     truth = world(LatLong((128, 64)).directions())
     # the tilted zone between the two rims may be unseen
     seen = image.pixels[..., 3] > 0.99
@@ -332,7 +332,7 @@ def test_bad_align_options(tmp_path: Path, arguments: list[str], message: str) -
 def test_bad_probe_options(folder: Path) -> None:
     front, out = folder / "build/front.exr", folder / "out.exr"
     for arguments, message in (
-        ([front], "--lens or --camera"),
+        ([front], "--lens, --camera or --ball"),
         ([front, "--lens", "equisolid:190", "--yaw", "0,180"], "1 numbers are needed"),
         ([front, "--lens", "equisolid:190", "--width", "31"], "--width"),
         ([front, "--lens", "equisolid:190", "--vignetting=-3"], "vignetting falls"),

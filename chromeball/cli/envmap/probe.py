@@ -315,7 +315,7 @@ def _probe(request: _Request, output: Path, as_json: bool) -> None:
         else:
             rotations, origin = world_from_shots(shots), None
         if request.refine and len(shots) > 1:
-            rotations, found = refined(shots, rotations, request.width, index)
+            rotations, found = refined(shots, rotations, index)
             stage.figures["refined"] = {
                 "degrees": np.degrees(found.angles),
                 "sigma_degrees": np.degrees(found.sigma),
