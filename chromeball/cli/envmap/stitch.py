@@ -157,8 +157,8 @@ def run(
     import numpy as np
 
     from chromeball.envmap.align import read_alignment
+    from chromeball.envmap.complete import Source, from_border
     from chromeball.envmap.mapping import LatLong
-    from chromeball.envmap.probe import complete
     from chromeball.envmap.stitch.blend import compose
     from chromeball.envmap.stitch.features import find
     from chromeball.envmap.stitch.lens import pixel_focal
@@ -202,7 +202,7 @@ def run(
             width = min(WIDEST, max(64, 64 * round(resolved / 64)))
         result = compose(frames, found.camera, rotations, width, light, progress=_say)
         missing = result.alpha == 0
-        complete(result.radiance, missing)
+        completed = from_border(result.radiance, missing) * float(Source.BORDER)
         solid = LatLong((width, width // 2)).solid_angles()
         notes = [*lens_notes, *found.notes]
         for note in notes:
@@ -237,7 +237,7 @@ def run(
         with stage.output(output.with_name(f"{output.stem}.directions.json")) as temporary:
             write_json(temporary, _directions(names, rotations, found))
         kept = dict(frames[0].attributes)
-        write_panorama(stage, output, result.radiance, result.alpha, kept, origin)
+        write_panorama(stage, output, result.radiance, result.alpha, kept, origin, completed)
     print_figures(stage.figures, as_json, output)
 
 
