@@ -348,7 +348,7 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert abs(figures["check_ratio"][0] - 1) < 0.02
     image = read_image(out)
     assert image.size == (256, 128)
-    assert image.channels == ("R", "G", "B", "A")
+    assert image.channels == ("R", "G", "B", "A", "completed")
     for suffix in ("preview.png", "seams.png", "check.png", "cameramodel", "directions.json"):
         assert (tmp_path / f"env.{suffix}").is_file()
     assert read_json(tmp_path / "env.exr.record.json")["stage"] == "envmap stitch"
