@@ -238,6 +238,12 @@ class Warp {
     }
   }
 
+  // Sample a of n across a pixel, -1/2 .. 1/2; two stand at Gauss's points, right for cubics.
+  static float offset(int a, int n) {
+    if (n == 2) return a ? 0.28867513f : -0.28867513f;
+    return (float(a) + 0.5f) / float(n) - 0.5f;
+  }
+
   void gather_row(int y, float* out, float* coverage, float* variance) const {
     thread_local Desk desk;
     thread_local std::vector<Sampling> counts;
@@ -248,9 +254,9 @@ class Warp {
     for (int x = 0; x < to_.width; ++x) {
       const auto [nx, ny] = counts[std::size_t(x)];
       for (int b = 0; b < ny; ++b) {
-        const float v = float(y) - 0.5f + (float(b) + 0.5f) / float(ny);
+        const float v = float(y) + offset(b, ny);
         for (int a = 0; a < nx; ++a) {
-          desk.u[n] = float(x) - 0.5f + (float(a) + 0.5f) / float(nx);
+          desk.u[n] = float(x) + offset(a, nx);
           desk.v[n] = v;
           desk.pixel[n] = x;
           if (++n == kBatch) look(desk, n, variance), n = 0;
