@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.envmap_lights import rows as lights_rows
+from bench.envmap_stitch import rows as stitch_rows
 from bench.row import Row
 from chromeball.envmap.mapping import (
     LatLong,
@@ -49,7 +50,7 @@ def rows(quick: bool) -> list[Row]:
     result: list[Row] = []
     for what, source, target in tasks:
         result += _task(what, source, target)
-    return result + lights_rows(quick)
+    return result + lights_rows(quick) + stitch_rows(quick)
 
 
 def _task(what: str, source: Mapping, target: Mapping) -> list[Row]:

@@ -523,7 +523,7 @@ class _Planner:
         merged = [f"{self.build}/{shot.bracket}.exr" for shot in probe.shot]
         inputs = list(merged)
         options: list[str] = []
-        for axis in ("yaw", "pitch", "roll"):
+        for axis in () if probe.directions else ("yaw", "pitch", "roll"):
             angles = [float(getattr(shot, axis)) for shot in probe.shot]
             if axis == "yaw" or any(angles):
                 options += _option(axis, ",".join(f"{angle:.10g}" for angle in angles))
@@ -557,6 +557,14 @@ class _Planner:
             options += _option("align", f"{self.build}/align.json")
             inputs.append(f"{self.build}/align.json")
         output = f"{self.build}/env.exr"
+        verb = "probe"
+        if probe.stitch:
+            name, verb = "envmap stitch", "stitch"
+            if probe.sigma:
+                options += _option("sigma", f"{probe.sigma:.10g}")
+            if probe.directions:
+                options += _option("directions", probe.directions)
+                inputs.append(probe.directions)
         return StagePlan(
             name,
             True,
@@ -564,7 +572,7 @@ class _Planner:
             tuple(inputs),
             (output,),
             (
-                *("chromeball", "envmap", "probe", *merged, *options),
+                *("chromeball", "envmap", verb, *merged, *options),
                 *("--width", str(scene.env.width), "-o", output),
             ),
             {},

@@ -138,6 +138,9 @@ class Probe(Table, frozen=True):
     Of mirror balls: ``camera`` is the one that photographed them (far away without),
     ``reflectance`` is divided by, and ``photographer`` degrees about the direction to the
     camera are left out.
+    ``stitch``: the shots' angles are
+    rough, and the pictures say the rest, with the lens's fall-off; ``directions`` is a file of
+    a tracker's in place of the angles, ``sigma`` how far either is off, degrees an axis.
     """
 
     shot: list[Shot]
@@ -148,6 +151,21 @@ class Probe(Table, frozen=True):
     refine: bool = True
     reflectance: Vector = (1.0, 1.0, 1.0)
     photographer: Annotated[float, Meta(ge=0, lt=120)] = 20.0
+    stitch: bool = False
+    directions: str | None = None
+    sigma: Positive | None = None
+
+    def __post_init__(self) -> None:
+        if self.stitch and len(self.shot) < 2:
+            raise ValueError("stitch needs two shots or more")
+        if self.stitch and self.vignetting:
+            raise ValueError("stitch finds the vignetting itself: leave it out")
+        if self.stitch and (
+            self.trim or not self.refine or self.reflectance != (1.0, 1.0, 1.0)
+        ):
+            raise ValueError("trim, refine and reflectance are not for stitch = true")
+        if not self.stitch and (self.directions or self.sigma):
+            raise ValueError("directions and sigma are for stitch = true")
 
 
 class Align(Table, frozen=True):

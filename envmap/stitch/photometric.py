@@ -22,6 +22,10 @@ type Array = NDArray[np.float64]
 
 #: Directions that frames are compared in, and the width of the pictures that are compared.
 DIRECTIONS, SMALL = 30_000, 320
+#: Where the curve is assumed (sRGB), all samples of an overlap share an error of this ln, and
+#: exposures told by metadata are trusted to as much.
+CURVE = 0.1
+FEW = 200  # samples of an overlap that tell half as much as many
 #: Prior standard deviations of e_i, of the c_k, and the relative noise of a sample.
 EXPOSURE, FALLOFF, NOISE = 1.0, 1.0, 0.002
 #: Terms of the fall-off.
@@ -106,9 +110,12 @@ def solve(
     grey = log @ np.array([0.25, 0.5, 0.25])
     ra, rb = r2[a, p], r2[b, p]
     sigma2 = 1 / weight[a, p] + 1 / weight[b, p]
+    told_by_camera = all("metadata" in frame.source for frame in frames)
+    assumed = any(frame.source.startswith("sRGB") for frame in frames)
+    trust = CURVE if told_by_camera else EXPOSURE
     columns = count + TERMS
     prior = np.r_[
-        np.full(count, 1 / EXPOSURE**2 if exposure else 1e12),
+        np.full(count, 1 / trust**2 if exposure else 1e12),
         np.full(TERMS, 1 / FALLOFF**2 if falloff else 1e12),
     ]
 
@@ -144,6 +151,12 @@ def solve(
         t = (y - said) / np.sqrt(sigma2)
         scale = 1.4826 * float(np.median(np.abs(t)))
         w = 1 / (1 + (t / max(2 * scale, 1e-9)) ** 2) ** 2 / sigma2
+        if assumed:
+            # many samples of one overlap know no more than the curve, and none is wrong
+            w = 1 / np.maximum(np.abs(t) / max(1.5 * scale, 1e-9), 1)
+            pair = a * count + b
+            number = np.bincount(pair)[pair]
+            w *= number / (number + FEW) / (np.bincount(pair, w)[pair] * CURVE**2)
         matrix, right = normal(w, y - said, powers)
         step = np.linalg.solve(matrix, right - prior * x)
         fall = x[count:] + step[count:]
@@ -154,7 +167,9 @@ def solve(
         x = x + step
         if float(np.abs(step).max()) < 1e-9:
             break
-    covariance = np.linalg.inv(matrix) * max(scale, 1e-9) ** 2
+    covariance = np.linalg.inv(matrix)
+    if not assumed:
+        covariance *= max(scale, 1e-9) ** 2
     # exposures against their mean, which the frames leave open
     mean = np.eye(columns)
     mean[:count, :count] -= 1 / count

@@ -20,6 +20,7 @@ from chromeball.cli.envmap.arguments import (
 from chromeball.scene.errors import UserError
 
 if TYPE_CHECKING:
+    from chromeball.envmap.stitch.bend import Bends
     from chromeball.envmap.stitch.features import Features
     from chromeball.envmap.stitch.frames import Frame
     from chromeball.envmap.stitch.lens import Freedom
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from chromeball.scene.camera import CameraModel
 
 type Refine = Literal["none", "focal", "lens", "all"]
+type Bend = Literal["auto", "no"]
 type Expose = Literal["auto", "keep", "white-balance"]
 
 #: Maps are no wider than this unless a width is asked for.
@@ -49,6 +51,7 @@ def stitch(
     clicked: int | None = None,
     response: Path | None = None,
     exposure: Expose = "auto",
+    bend: Bend = "auto",
     width: int | None = None,
     output: Out,
     json: Json = False,
@@ -61,7 +64,8 @@ def stitch(
     Parameters
     ----------
     frames
-        Radiance pictures, or photographs of one exposure each, of one camera and zoom.
+        Radiance pictures, or photographs of one exposure each, of one camera and zoom; or one
+        scene file that says everything.
     camera
         The calibrated camera.
     lens
@@ -90,6 +94,9 @@ def stitch(
     exposure
         auto: exposures and vignetting are made equal where frames overlap; keep: they are
         right; white-balance: each channel by itself.
+    bend
+        auto: where the camera moved between frames (parallax) they are bent a little so that
+        they meet, and that is told; no: they are not.
     width
         Of the map, in pixels; by default what the frames resolve.
     output
@@ -100,6 +107,12 @@ def stitch(
     """
     from chromeball.envmap.stitch.directions import SESSION, from_angles, read_directions
 
+    if len(frames) == 1 and frames[0].suffix == ".toml":
+        given = (camera, lens, refine, directions, yaw, pitch, roll, sigma, align, clicked)
+        if any(option is not None for option in (*given, response, width)):
+            raise UserError("a scene file says everything: leave out the other options")
+        _of_scene(frames[0], output, json)
+        return
     count = len(frames)
     if camera is not None and lens is not None:
         raise UserError("give --lens or --camera, not both")
@@ -131,9 +144,45 @@ def stitch(
         clicked=clicked,
         response=response,
         exposure=exposure,
+        bend=bend,
         width=width,
         output=output,
         as_json=json,
+    )
+
+
+def _of_scene(path: Path, output: Path, as_json: bool) -> None:
+    """The command that `plan` writes, for the scene as it is."""
+    from chromeball.cli.stages import lens_text
+    from chromeball.scene.manifest import read_scene
+
+    scene = read_scene(path)
+    root, probe = path.parent, scene.probe
+    if scene.env.file:
+        raise UserError(
+            f"{scene.env.file} is a finished panorama: nothing to stitch", file=path
+        )
+    if probe is None or not probe.stitch:
+        raise UserError("[probe] has no stitch = true: use `envmap probe`", file=path)
+    aimed = probe.directions is None
+
+    def angles(axis: str) -> str | None:
+        values = ",".join(f"{getattr(shot, axis):.10g}" for shot in probe.shot)
+        return values if aimed else None
+
+    stitch(
+        [root / scene.folder / f"{shot.bracket}.exr" for shot in probe.shot],
+        camera=root / probe.camera if probe.camera else None,
+        lens=lens_text(probe.lens) if probe.lens and not probe.camera else None,
+        directions=root / probe.directions if probe.directions else None,
+        yaw=angles("yaw"),
+        pitch=angles("pitch"),
+        roll=angles("roll"),
+        sigma=probe.sigma,
+        align=root / scene.folder / "align.json" if scene.align else None,
+        width=scene.env.width,
+        output=output,
+        json=as_json,
     )
 
 
@@ -149,6 +198,7 @@ def run(
     clicked: int | None,
     response: Path | None,
     exposure: Expose,
+    bend: Bend,
     width: int | None,
     output: Path,
     as_json: bool,
@@ -159,6 +209,8 @@ def run(
     from chromeball.envmap.align import read_alignment
     from chromeball.envmap.complete import Source, from_border
     from chromeball.envmap.mapping import LatLong
+    from chromeball.envmap.stitch.bend import PARALLAX, bent_all, parallax
+    from chromeball.envmap.stitch.bend import bend as bent_to_meet
     from chromeball.envmap.stitch.blend import compose
     from chromeball.envmap.stitch.features import find
     from chromeball.envmap.stitch.lens import pixel_focal
@@ -191,6 +243,11 @@ def run(
             origin = pose.translation
         elif clicked is not None:
             raise UserError(f"--clicked {clicked} is for --align")
+        bends = None
+        if bend == "auto" and parallax(found.adjusted) > PARALLAX:
+            _say("bending frames: the camera moved between them")
+            bends = bent_to_meet(found.matches, found.adjusted)
+            frames = bent_all(frames, bends)
         if exposure == "keep":
             light = unchanged(len(frames))
         else:
@@ -205,6 +262,12 @@ def run(
         completed = from_border(result.radiance, missing) * float(Source.BORDER)
         solid = LatLong((width, width // 2)).solid_angles()
         notes = [*lens_notes, *found.notes]
+        if bends is not None:
+            notes.append(
+                f"the camera moved between frames (parallax): they are bent by up to "
+                f"{bends.largest:.0f} px, half of the held-out matches lie within "
+                f"{bends.held_out[1]:.2f} px instead of {bends.held_out[0]:.2f}"
+            )
         for note in notes:
             print(f"note: {note}", file=sys.stderr)
         stage.figures |= {
@@ -220,6 +283,7 @@ def run(
             "overlap_scatter": light.scatter,
             "photometric": light.applied,
             "energy_error": result.energy_errors,
+            "bend_px": None if bends is None else _bend_figures(bends),
             "hot_share": result.hot_share,
             "blend_energy": result.blend_energy,
             "limited_pixels": result.limited,
@@ -329,6 +393,17 @@ def _orientation_figures(found: Oriented, names: Sequence[str]) -> dict[str, Any
         "off_prior_degrees": np.degrees(adjusted.prior_residual),
         "doubted": [names[k] for k in found.doubted],
         "refused_pairs": [[names[i], names[j]] for i, j in found.refused],
+    }
+
+
+def _bend_figures(bends: Bends) -> dict[str, Any]:
+    """Medians and RMS in pixels, of the matches that count, and of those held out."""
+    return {
+        "largest": bends.largest,
+        "matches": bends.inliers,
+        "before": bends.before,
+        "after": bends.after,
+        "held_out": bends.held_out,
     }
 
 

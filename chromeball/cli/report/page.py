@@ -37,6 +37,8 @@ DEEDS = {
     "calibrate lens": "Intrinsics and distortion of the lens, from photographs of a target.",
     "envmap align": "World axes and scale from the corners of a rectangle on the floor.",
     "envmap probe": "The shots of the light probe resampled to one lat-long map in world axes.",
+    "envmap stitch": "Frames of several directions as one map: where each looked is found from "
+    "what they have in common, exposures are made equal, moving things come from one frame.",
     "envmap sun": "The light of a sun that every exposure clipped, restored.",
     "envmap lights": "The map as a few directional lights of the same total irradiance, and "
     "the harmonics of what they leave out.",
