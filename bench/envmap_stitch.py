@@ -96,11 +96,11 @@ def _views(file: Path) -> list[Row]:
             *(100 * abs(energy[0] / energy[1] - 1), "%"),
             "exposures and vignetting solved; no turn but the common one is taken out",
         ),
-        *_opencv(frames, lens.intrinsics[0], true, what),
+        *_opencv(frames, true, what),
     ]
 
 
-def _opencv(frames: list[Frame], focal: float, true: Array, what: str) -> list[Row]:
+def _opencv(frames: list[Frame], true: Array, what: str) -> list[Row]:
     """OpenCV's own estimator on the same views; it knows perspective lenses alone."""
     import cv2
 
@@ -112,17 +112,20 @@ def _opencv(frames: list[Frame], focal: float, true: Array, what: str) -> list[R
     ]
     start = time.process_time()
     stitcher = cv2.Stitcher.create(cv2.Stitcher_PANORAMA)
-    status = stitcher.estimateTransform(codes)
+    try:
+        status = stitcher.estimateTransform(codes)
+        used = 0 if status != 0 else len(np.ravel(stitcher.component()))
+        note = f"{used} of {len(frames)} frames connected (it has no fisheye)"
+    except cv2.error as error:  # a frame of little contrast ends it
+        used, note = 0, f"fails: {' '.join(str(error.err).split())[:60]}"
     seconds = time.process_time() - start
-    used = 0 if status != 0 else len(np.ravel(stitcher.component()))
-    note = f"{used} of {len(frames)} frames connected (it has no fisheye)"
-    error = 180.0
+    off_by = 180.0
     if used == len(frames):
         turns = np.array([np.asarray(c.R, float) for c in stitcher.cameras()])
         u, _, vt = np.linalg.svd(np.einsum("nab,ncb->ac", true, turns))
         off = angle_between((u @ vt) @ turns, true)
-        error = math.degrees(math.sqrt(float(np.mean(off**2))))
-    row = Row("envmap", f"{what}: orientation", "cv2.Stitcher", seconds, error, "deg", note)
+        off_by = math.degrees(math.sqrt(float(np.mean(off**2))))
+    row = Row("envmap", f"{what}: orientation", "cv2.Stitcher", seconds, off_by, "deg", note)
     return [row]
 
 

@@ -520,10 +520,12 @@ class _Planner:
             )
         if probe is None:
             return StagePlan(name, False, "no [probe]")
+        if probe.stitch:
+            return self._stitch(probe)
         merged = [f"{self.build}/{shot.bracket}.exr" for shot in probe.shot]
         inputs = list(merged)
         options: list[str] = []
-        for axis in () if probe.directions else ("yaw", "pitch", "roll"):
+        for axis in ("yaw", "pitch", "roll"):
             angles = [float(getattr(shot, axis)) for shot in probe.shot]
             if axis == "yaw" or any(angles):
                 options += _option(axis, ",".join(f"{angle:.10g}" for angle in angles))
@@ -557,14 +559,6 @@ class _Planner:
             options += _option("align", f"{self.build}/align.json")
             inputs.append(f"{self.build}/align.json")
         output = f"{self.build}/env.exr"
-        verb = "probe"
-        if probe.stitch:
-            name, verb = "envmap stitch", "stitch"
-            if probe.sigma:
-                options += _option("sigma", f"{probe.sigma:.10g}")
-            if probe.directions:
-                options += _option("directions", probe.directions)
-                inputs.append(probe.directions)
         return StagePlan(
             name,
             True,
@@ -572,8 +566,45 @@ class _Planner:
             tuple(inputs),
             (output,),
             (
-                *("chromeball", "envmap", verb, *merged, *options),
+                *("chromeball", "envmap", "probe", *merged, *options),
                 *("--width", str(scene.env.width), "-o", output),
+            ),
+            {},
+        )
+
+    def _stitch(self, probe: Probe) -> StagePlan:
+        env = self.scene.env
+        if env.ground or env.fill:
+            raise UserError("env.ground and env.fill are not for [probe] stitch = true")
+        merged = [f"{self.build}/{shot.bracket}.exr" for shot in probe.shot]
+        inputs = list(merged)
+        options: list[str] = []
+        if probe.directions:
+            options += _option("directions", probe.directions)
+            inputs.append(probe.directions)
+        else:
+            for axis in ("yaw", "pitch", "roll"):
+                angles = ",".join(f"{getattr(shot, axis):.10g}" for shot in probe.shot)
+                options += _option(axis, angles)
+        if probe.sigma:
+            options += _option("sigma", f"{probe.sigma:.10g}")
+        if probe.camera:
+            options += _option("camera", probe.camera)
+            inputs.append(probe.camera)
+        elif probe.lens:
+            options += _option("lens", lens_text(probe.lens))
+        if self.scene.align:
+            options += _option("align", f"{self.build}/align.json")
+            inputs.append(f"{self.build}/align.json")
+        return StagePlan(
+            "envmap stitch",
+            True,
+            f"{len(merged)} shots, where they looked is refined from the pictures",
+            tuple(inputs),
+            (self._env(),),
+            (
+                *("chromeball", "envmap", "stitch", *merged, *options),
+                *("--width", str(env.width), "-o", self._env()),
             ),
             {},
         )

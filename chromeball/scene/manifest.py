@@ -138,9 +138,9 @@ class Probe(Table, frozen=True):
     Of mirror balls: ``camera`` is the one that photographed them (far away without),
     ``reflectance`` is divided by, and ``photographer`` degrees about the direction to the
     camera are left out.
-    ``stitch``: the shots' angles are
-    rough, and the pictures say the rest, with the lens's fall-off; ``directions`` is a file of
-    a tracker's in place of the angles, ``sigma`` how far either is off, degrees an axis.
+    ``stitch``: the shots' angles are rough, and the pictures say the rest, with the lens's
+    fall-off; ``directions`` is a file of a tracker's in place of the angles, ``sigma`` how far
+    either is off, degrees an axis.
     """
 
     shot: list[Shot]
@@ -164,6 +164,8 @@ class Probe(Table, frozen=True):
             self.trim or not self.refine or self.reflectance != (1.0, 1.0, 1.0)
         ):
             raise ValueError("trim, refine and reflectance are not for stitch = true")
+        if self.stitch and any(shot.ball or shot.mask or shot.lens for shot in self.shot):
+            raise ValueError("stitch is for shots of one lens, without ball, mask or own lens")
         if not self.stitch and (self.directions or self.sigma):
             raise ValueError("directions and sigma are for stitch = true")
 

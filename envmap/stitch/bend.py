@@ -190,6 +190,10 @@ def _evenness() -> Any:
     from scipy import sparse
 
     nx, ny = NODES
-    across = sparse.kron(sparse.eye(ny), sparse.diags([-1.0, 1.0], [0, 1], shape=(nx - 1, nx)))
-    down = sparse.kron(sparse.diags([-1.0, 1.0], [0, 1], shape=(ny - 1, ny)), sparse.eye(nx))
+
+    def steps(count: int) -> Any:
+        return sparse.csr_matrix(np.diff(np.eye(count), axis=0))
+
+    across = sparse.kron(sparse.eye(ny), steps(nx))
+    down = sparse.kron(steps(ny), sparse.eye(nx))
     return sparse.vstack([EVEN * across, EVEN * down, SMALL * sparse.eye(nx * ny)])

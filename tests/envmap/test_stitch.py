@@ -12,8 +12,10 @@ import pytest
 from numpy.typing import NDArray
 
 from chromeball.cli.main import build_app
+from chromeball.cli.stages import stages
 from chromeball.envmap.mapping import LatLong, of_camera
 from chromeball.envmap.probe import rotation
+from chromeball.envmap.stitch.bend import bend, bent
 from chromeball.envmap.stitch.blend import compose
 from chromeball.envmap.stitch.directions import read_directions
 from chromeball.envmap.stitch.features import Features, find
@@ -25,6 +27,7 @@ from chromeball.envmap.stitch.rotations import Matches, adjust, angle_between, e
 from chromeball.scene.camera import WORLD_FROM_LATLONG, CameraModel
 from chromeball.scene.errors import UserError
 from chromeball.scene.image import read_image, write_exr
+from chromeball.scene.manifest import read_scene
 from chromeball.scene.record import read_json
 
 type Array = NDArray[np.float64]
@@ -356,6 +359,57 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     again = read_directions(tmp_path / "env.directions.json", [f"f{k}" for k in range(7)])
     assert misplaced(again.rotations, turns()) < 0.05
     assert CameraModel.read(tmp_path / "env.cameramodel").size == SIZE
+
+
+def test_a_scene_is_planned_and_stitched(tmp_path: Path) -> None:
+    (tmp_path / "build").mkdir()
+    shots = ""
+    for k in range(3):
+        write_exr(tmp_path / f"build/f{k}.exr", pictures()[k])
+        write_exr(tmp_path / f"r{k}.exr", pictures()[k])
+        shots += f'[[bracket]]\nname = "f{k}"\nframes = ["r{k}.exr"]\ntimes = [1]\n'
+        shots += f'[[probe.shot]]\nbracket = "f{k}"\nyaw = {60 * k}\nroll = 90\npitch = -5\n'
+    LENS.write(tmp_path / "lens.cameramodel")
+    text = (
+        f'name = "test"\n[env]\nwidth = 128\n[probe]\nstitch = true\nsigma = 3\n'
+        f'camera = "lens.cameramodel"\n{shots}'
+    )
+    (tmp_path / "scene.toml").write_text(text)
+    plan = stages(read_scene(tmp_path / "scene.toml"), tmp_path / "scene.toml")
+    (stage,) = [s for s in plan if s.name.startswith("envmap stitch")]
+    assert stage.needed
+    assert stage.inputs[-1] == "lens.cameramodel"
+    assert "--yaw" in stage.command
+    run("envmap", "stitch", tmp_path / "scene.toml", "-o", tmp_path / "build/env.exr")
+    found = read_directions(tmp_path / "build/env.directions.json", ["f0", "f1", "f2"])
+    assert misplaced(found.rotations, turns()[:3]) < 0.05
+    for wrong in ("vignetting = [0.1]", "trim = 1"):
+        (tmp_path / "scene.toml").write_text(text.replace("sigma = 3", wrong))
+        with pytest.raises(UserError, match="stitch"):
+            read_scene(tmp_path / "scene.toml")
+
+
+def test_a_moving_camera_is_bent_to_meet() -> None:
+    """Features that shift by their nearness: bent, what was held out meets as well."""
+    rng = np.random.default_rng(6)
+    true = turns()[:2]
+    d = rng.normal(size=(9000, 3))
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    near = d[:, 1] * 0.02 - 0.01  # the ground is nearer than the sky
+    moved = d + near[:, None] * np.array([1.0, 0, 0])
+    a, b = (LENS.project(x @ r) for x, r in zip((d, moved), true, strict=True))
+    with np.errstate(invalid="ignore"):
+        inside = ((a > 0) & (b > 0) & (a < [299, 199]) & (b < [299, 199])).all(axis=1)
+    a, b = a[inside], b[inside]
+    matches = Matches(np.tile([0, 1], (len(a), 1)), a, b, np.ones(len(a)))
+    found = adjust(matches, true, LENS)
+    bends = bend(matches, found)
+    assert bends.held_out[0] > 0.15
+    assert bends.held_out[1] < 0.4 * bends.held_out[0]
+    frame = bent(Frame("a", pictures()[0]), bends.shifts[0])
+    assert frame.valid is not None
+    assert frame.radiance.shape == pictures()[0].shape
+    assert 0.9 < frame.valid.mean() <= 1
 
 
 @pytest.mark.parametrize(
