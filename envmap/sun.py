@@ -185,8 +185,7 @@ def restore_from_reading(
     """
     n = np.asarray(normal, float) / np.linalg.norm(np.asarray(normal, float))
     own = float(irradiance(radiance, n) @ LUMINANCE)
-    tint = np.asarray(sun.irradiance if color is None else color, float)
-    tint = tint / float(tint @ LUMINANCE)
+    tint = _tint(sun, color)
     cosine = _facing(n, sun)
     lack = (reading - own) / cosine
     if lack <= 0:
@@ -205,11 +204,13 @@ def restore_from_ratio(
     normal: ArrayLike,
     *,
     accuracy: float = 0.05,
+    color: ArrayLike | None = None,
     radius: float = SUN_RADIUS,
 ) -> Restored:
     """The sun that makes a card `ratio` times as bright in the light as in the sun's shadow.
 
-    `ratio`: of R, G, B. In the shadow the card sees the rest of the map.
+    `ratio`: (3,) of R, G, B, or (1,) of luminance, where `color` (3,) is the sun's, that of its
+    glare in the map unless given. In the shadow the card sees the rest of the map.
 
     Raises
     ------
@@ -226,6 +227,8 @@ def restore_from_ratio(
     cosine = _facing(n, sun)
     shade = irradiance(without_sun(radiance, sun), n)
     lack = (times * shade - irradiance(radiance, n)) / cosine
+    if times.size == 1:
+        lack = float(lack @ LUMINANCE) * _tint(sun, color)
     if not float(lack @ LUMINANCE) > 0 or lack.min() < 0:
         raise UserError("the map has as much sun as that ratio says: there is no light missing")
     spread = accuracy * float((times * shade) @ LUMINANCE) / cosine
@@ -265,6 +268,14 @@ def ratio_of_ball(
         gradient = share * np.array([-direct / k**2, 1 / k])
         sigma[c] = math.sqrt(float(gradient @ covariance @ gradient))
     return ratio, sigma
+
+
+def _tint(sun: Sun, color: ArrayLike | None) -> Array:
+    """The colour of the sun's light, its luminance 1."""
+    tint = np.asarray(sun.irradiance if color is None else color, float)
+    if not (tint >= 0).all() or not float(tint @ LUMINANCE) > 0:
+        raise UserError("the sun's colour must be positive")
+    return tint / float(tint @ LUMINANCE)
 
 
 def _facing(n: Array, sun: Sun) -> float:

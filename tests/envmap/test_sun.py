@@ -108,6 +108,10 @@ def test_restored_from_a_card() -> None:
     # the shadow of a card hides what is near the sun, too
     np.testing.assert_allclose(made.sun.irradiance, LIGHT, rtol=0.03)
     np.testing.assert_allclose(made.sun.angular_radius, SUN_RADIUS)
+    # one ratio is luminance: the sun keeps its own colour, not the sky's
+    bright = [float(irradiance(truth, UP) @ LUMINANCE) / float(shade @ LUMINANCE)]
+    one = restore_from_ratio(map_, found, bright, UP, color=LIGHT)
+    np.testing.assert_allclose(one.sun.irradiance, LIGHT, rtol=0.03)
     # the map's scale does not matter
     scaled = restore_from_ratio(
         map_ * np.float32(1e-3), find_sun(map_ * np.float32(1e-3), marked) or found, ratio, UP

@@ -53,7 +53,7 @@ def sun(
     clipped
         Values from here on are clipped, where the map has no channel that says so.
     color
-        R,G,B of the sun's light, for --meter; that of its glare unless given.
+        R,G,B of the sun's light, for --meter or one ratio; that of its glare unless given.
     radius
         Of the disc, degrees.
     accuracy
@@ -87,8 +87,8 @@ def sun(
         raise UserError("--ball needs --circle and --camera")
     if ball is None and (circle or camera):
         raise UserError("--circle and --camera are for --ball")
-    if color is not None and meter is None:
-        raise UserError("--color is for --meter: a ratio has its own colour")
+    if color is not None and ball is not None:
+        raise UserError("--color is for --meter and --ratio: a ball has its own colour")
     if not 0.01 <= radius <= 10 or not 0 < accuracy < 1:
         raise UserError("--radius is 0.01 to 10 degrees, --accuracy between 0 and 1")
     image = read_latlong(env)
@@ -124,8 +124,8 @@ def sun(
             if not n.any():
                 raise UserError("--normal 0,0,0: a direction is needed")
         try:
+            tint = None if color is None else parse_numbers(color, "--color", 3)
             if meter is not None:
-                tint = None if color is None else parse_numbers(color, "--color", 3)
                 made = restore_from_reading(
                     image.rgb, found, meter / level, n, accuracy=accuracy, color=tint,
                     radius=math.radians(radius),
@@ -142,11 +142,16 @@ def sun(
                     values = parse_numbers(ratio, "--ratio", None)
                     if len(values) not in (1, 3):
                         raise UserError("--ratio: one number, or three for R,G,B")
-                    times = np.array(values if len(values) == 3 else values * 3)
+                    if color is not None and len(values) == 3:
+                        raise UserError(
+                            "--color is for one --ratio: three have their own colour"
+                        )
+                    times = np.array(values)
                     source = f"a card {ratio} times as bright in the sun as in its shadow"
                 made = restore_from_ratio(
-                    image.rgb, found, times, n, accuracy=accuracy, radius=math.radians(radius)
-                )
+                    image.rgb, found, times, n, accuracy=accuracy, color=tint,
+                    radius=math.radians(radius),
+                )  # fmt: skip
         except UserError as error:
             raise error if error.file else UserError(error.what, file=env) from error
         stage.figures |= {
