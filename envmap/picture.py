@@ -15,6 +15,13 @@ from chromeball.scene.color import luminance
 from chromeball.scene.errors import UserError
 from chromeball.scene.image import read_image, to_display, write_picture
 
+#: What a map says about itself and is handed on, by OpenImageIO's names: `DateTime` is
+#: OpenEXR's capDate, `Copyright` its owner.
+KEPT = (
+    *("chromaticities", "whiteLuminance", "origin", "worldToCamera"),
+    *("DateTime", "utcOffset", "Copyright", "longitude", "latitude", "altitude"),
+)
+
 
 @dataclass(frozen=True)
 class Radiance:
@@ -74,11 +81,7 @@ def read_radiance(path: str | os.PathLike[str]) -> Radiance:
             f"{int(bad.sum())} pixels are NaN, infinite or negative, the first at x {x}, y {y}",
             file=path,
         )
-    kept = {
-        name: image.attributes[name]
-        for name in ("chromaticities", "whiteLuminance", "origin")
-        if name in image.attributes
-    }
+    kept = {name: image.attributes[name] for name in KEPT if name in image.attributes}
     clipped = pixels[..., names.index("clipped")] > 0 if "clipped" in names else None
     sigma = None
     if all(f"sigma.{name}" in names for name in "RGB"):
@@ -104,12 +107,42 @@ def read_latlong(path: str | os.PathLike[str]) -> Radiance:
     return found
 
 
-def latlong_attributes(kept: Mapping[str, Any], origin: Any = None) -> dict[str, Any]:
-    """Attributes of a lat-long EXR; OpenImageIO writes `textureformat` as OpenEXR's envmap."""
+def latlong_attributes(
+    kept: Mapping[str, Any], origin: Any = None, rotation: NDArray[np.float64] | None = None
+) -> dict[str, Any]:
+    """Attributes of a lat-long EXR; OpenImageIO writes `textureformat` as OpenEXR's envmap.
+
+    `origin` (3,) metres is where the map was seen from. `rotation` (3, 3) is what the map's
+    axes are to the world's, ``d_map = rotation @ d_world``; without it, and without a
+    ``worldToCamera`` among `kept`, they are the same.
+    """
     attributes: dict[str, Any] = {**kept, "textureformat": "LatLong Environment"}
     if origin is not None:
         attributes["origin"] = np.asarray(origin, float)
+    if rotation is not None or origin is not None or "worldToCamera" not in kept:
+        turn = np.eye(3) if rotation is None else rotation
+        place = np.ravel(attributes.get("origin", np.zeros(3)))
+        matrix = np.eye(4)  # OpenEXR multiplies rows: p_camera = p_world @ matrix
+        matrix[:3, :3], matrix[3, :3] = turn.T, -turn @ place
+        attributes["worldToCamera"] = matrix
     return attributes
+
+
+def map_from_world(attributes: Mapping[str, Any]) -> NDArray[np.float64]:
+    """The rotation (3, 3) of :func:`latlong_attributes`, from a map's attributes.
+
+    Raises
+    ------
+    UserError
+        When ``worldToCamera`` turns nothing, but distorts.
+
+    """
+    if "worldToCamera" not in attributes:
+        return np.eye(3)
+    turn = np.asarray(attributes["worldToCamera"], float).reshape(4, 4)[:3, :3].T
+    if not (np.allclose(turn @ turn.T, np.eye(3), atol=1e-4) and np.linalg.det(turn) > 0):
+        raise UserError("its attribute worldToCamera is no rotation; remove it")
+    return turn
 
 
 def tone_mapped(

@@ -332,7 +332,12 @@ def _exr_spec(
     spec = oiio.ImageSpec(*size, len(channels), "float")
     spec.channelnames = tuple(channels)
     spec.attribute("compression", "zip")
-    merged: dict[str, Any] = {"chromaticities": REC709_CHROMATICITIES, **(attributes or {})}
+    # without a DateTime, OpenImageIO gives the time of writing for the time of capture
+    merged: dict[str, Any] = {
+        "chromaticities": REC709_CHROMATICITIES,
+        "DateTime": "",
+        **(attributes or {}),
+    }
     for name, value in merged.items():
         match value:
             case bool() | int():
@@ -344,6 +349,8 @@ def _exr_spec(
             case _:
                 flat = tuple(float(v) for v in np.ravel(value))
                 kind = "float" if len(flat) == 1 else f"float[{len(flat)}]"
+                if name == "worldToCamera":
+                    kind = "matrix"
                 spec.attribute(name, oiio.TypeDesc(kind), flat)
     return spec
 
@@ -378,6 +385,15 @@ def write_picture(
             spec.attribute("Exif:LensModel", exposure.lens)
     with atomic_output(path) as temporary:
         _write(temporary, spec, np.ascontiguousarray(pixels), path)
+
+
+def write_hdr(path: str | os.PathLike[str], rgb: NDArray[np.float32]) -> None:
+    """Write (H, W, 3) as Radiance's RGBE, whole or not at all; 8 bits a channel."""
+    import OpenImageIO as oiio
+
+    spec = oiio.ImageSpec(rgb.shape[1], rgb.shape[0], 3, "float")
+    with atomic_output(path) as temporary:
+        _write(temporary, spec, np.ascontiguousarray(rgb, np.float32), path)
 
 
 def to_display(rgb: NDArray[Any], exposure: float = 1.0) -> NDArray[np.uint8]:

@@ -3,6 +3,7 @@
 from cyclopts import App
 
 from chromeball.cli.envmap.align import align
+from chromeball.cli.envmap.export import export
 from chromeball.cli.envmap.harmonics import harmonics
 from chromeball.cli.envmap.lights import lights
 from chromeball.cli.envmap.prefilter import prefilter
@@ -12,5 +13,5 @@ from chromeball.cli.envmap.sun import sun
 from chromeball.cli.envmap.warp import warp
 
 app = App(name="envmap", help="The light around a point.")
-for _command in (warp, align, probe, stitch, sun, lights, harmonics, prefilter):
+for _command in (warp, align, probe, stitch, sun, lights, harmonics, prefilter, export):
     app.command(_command)

@@ -128,7 +128,8 @@ def write_panorama(
     from chromeball.envmap.picture import latlong_attributes, tone_mapped, write_preview
     from chromeball.scene.image import write_exr
 
-    kept.pop("origin", None)
+    for name in ("origin", "worldToCamera"):
+        kept.pop(name, None)
     stage.figures["preview"] = write_preview(output, "preview", tone_mapped(radiance, alpha))
     with stage.output(output) as temporary:
         write_exr(

@@ -76,7 +76,12 @@ def warp(
         Print the figures as JSON.
 
     """
-    from chromeball.envmap.picture import latlong_attributes, tone_mapped, write_preview
+    from chromeball.envmap.picture import (
+        latlong_attributes,
+        map_from_world,
+        tone_mapped,
+        write_preview,
+    )
     from chromeball.envmap.probe import rotation
     from chromeball.envmap.resample import carry
     from chromeball.envmap.resample import warp as resample
@@ -91,6 +96,8 @@ def warp(
     outputs = files_of(output, to)
     image = read_map(picture, from_)
     kept = dict(image.attributes)
+    if from_ in ("fisheye", "mirror"):
+        kept.pop("worldToCamera", None)  # of a camera's axes, not a map's
     if from_ == to == "mirror":
         optics_in = Optics(ball_distance=ball_distance, focal=focal)
         source = source_map(from_, image.size, optics_in, picture)
@@ -133,9 +140,11 @@ def warp(
                 preview, "preview", tone_mapped(result.radiance, result.coverage)
             ),
         }
+        turned = None
         if any(angles):
+            turned = turn @ map_from_world(kept)
             kept.pop("origin", None)
-        attributes = latlong_attributes(kept) if to == "latlong" else kept
+        attributes = latlong_attributes(kept, rotation=turned) if to == "latlong" else kept
         _write(stage, outputs, planes, channels, attributes)
     if target.density > FINER * source.density:
         print(

@@ -43,6 +43,7 @@ DEEDS = {
     "envmap lights": "The map as a few directional lights of the same total irradiance, and "
     "the harmonics of what they leave out.",
     "envmap harmonics": "Irradiance in spherical harmonics, with its error.",
+    "envmap export": "The map turned as another program expects it.",
     "envmap prefilter": "The map blurred by the GGX lobe, for real-time engines.",
     "calibrate pose": "Where the photograph was taken from, by four points on the floor.",
     "stand-in build": "Stand-in geometry of the real place, as drawn on the panorama.",
