@@ -4,7 +4,6 @@ A fisheye of 340 degrees that looks along Blender's -X, 64 x 64, one sample a pi
 """
 
 # pyright: reportMissingImports=false, reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
-# ruff: noqa: E501
 import math
 import sys
 
