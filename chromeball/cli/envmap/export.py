@@ -85,7 +85,7 @@ def export(
         found = oriented(image.rgb, convention) if not keep_pixels else None
         radiance = image.rgb if found is None else found.radiance
         if scale != 1:
-            if float(radiance.max()) * scale > np.finfo(np.float32).max:
+            if float(radiance.max()) * scale > float(np.finfo(np.float32).max):
                 raise UserError(f"--scale {scale:g}: the brightest pixel becomes infinite")
             radiance = radiance * np.float32(scale)
         top = float(radiance.max())
