@@ -7,7 +7,9 @@ and Zisserman 2012); mutual nearest neighbours with a ratio test.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +23,8 @@ FLATTEN = 0.7
 #: Codes a natural unit of what is left.
 CONTRAST = 60.0
 RATIO = 0.8
+#: Contrast of the faintest features, and the cells (across, down) that have their share each.
+FAINTEST, CELLS = 0.008, (9, 6)
 #: Features a frame, and how few make one look closer.
 LIMIT, FEW = 2000, 300
 
@@ -84,25 +88,36 @@ def detect(
     import cv2
 
     # without the precise upscale all places are 0.25 px off
-    sift = cv2.SIFT.create(nfeatures=limit, contrastThreshold=0.02, enable_precise_upscale=True)
+    sift = cv2.SIFT.create(contrastThreshold=FAINTEST, enable_precise_upscale=True)
     mask = None
     if valid is not None:
         inner = np.pad(valid, 1).astype(np.uint8)
         mask = cv2.erode(inner, np.ones((13, 13), np.uint8))[1:-1, 1:-1]
-    points, descriptors = sift.detectAndCompute(picture, mask)
+    points = sift.detect(picture, mask)
     size = (picture.shape[1], picture.shape[0])
     if not points:
         return Features(np.zeros((0, 2)), np.zeros(0), np.zeros((0, 128), np.float32), size)
-    # strongest first
-    order = np.argsort([-p.response for p in points], kind="stable")
-    points, descriptors = [points[k] for k in order], descriptors[order]
+    points = [points[k] for k in _spread(points, size, limit)]
+    points, descriptors = sift.compute(picture, points)
     # a place with two orientations counts twice; that is right for matching
     pixels = np.array([p.pt for p in points], float)
     scale = np.array([p.size for p in points], float) / 2
-    root = np.sqrt(
-        np.maximum(descriptors, 0) / np.maximum(descriptors.sum(1, keepdims=True), 1e-9)
-    )
+    total = np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-9)
+    root = np.sqrt(np.maximum(descriptors, 0) / total)
     return Features(pixels, scale, np.ascontiguousarray(root, np.float32), size)
+
+
+def _spread(points: Sequence[Any], size: tuple[int, int], limit: int) -> NDArray[np.intp]:
+    """The strongest `limit` of all cells by turns: the sky has its share beside the trees."""
+    strength = np.array([p.response for p in points])
+    at = np.array([p.pt for p in points]) / size * CELLS
+    x, y = np.clip(at.astype(int), 0, np.array(CELLS) - 1).T
+    cell = y * CELLS[0] + x
+    order = np.lexsort((-strength, cell))
+    first = np.searchsorted(cell[order], cell[order])
+    rank = np.empty(len(points), np.intp)
+    rank[order] = np.arange(len(points)) - first
+    return np.lexsort((-strength, rank))[:limit]
 
 
 def match(

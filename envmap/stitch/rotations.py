@@ -307,7 +307,11 @@ def _summary(
     kept = values > 1e-10 * values[-1]
     kept[:3] = False  # the gauge
     positive = values[3:]
-    condition = float(positive[-1] / max(positive[0], 1e-300)) if len(positive) else math.inf
+    condition = (
+        float(positive[-1] / max(positive[0], 1e-18 * positive[-1]))
+        if len(positive)
+        else math.inf
+    )
     inverse = (vectors[:, kept] / values[kept]) @ vectors[:, kept].T
     inverse = inverse * unit[:, None] * unit[None, :]
     covariance = inverse @ middle @ inverse
