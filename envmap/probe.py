@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from chromeball.envmap.ball import BallCamera
 from chromeball.envmap.mapping import LatLong, Lens, Mapping, Radial
-from chromeball.envmap.refine import Refined, refine_turns
+from chromeball.envmap.refine import REACH, Refined, refine_turns
 from chromeball.envmap.resample import Warped, warp
 from chromeball.scene.camera import WORLD_FROM_LATLONG
 from chromeball.scene.color import luminance
@@ -106,14 +106,22 @@ def world_from_shots(
 
 
 def refined(
-    shots: Sequence[Shot], rotations: Sequence[Array], fixed: int = 0
+    shots: Sequence[Shot],
+    rotations: Sequence[Array],
+    fixed: int = 0,
+    width: int | None = None,
+    reach: float = REACH,
+    insist: bool = False,
 ) -> tuple[list[Array], Refined]:
     """`rotations` (world_from_shot) improved by what the shots see together.
 
-    Shot `fixed` keeps its place. Works at the shots' own resolution, on maps of 1024 at most.
+    Shot `fixed` keeps its place; all do where the result is not to be trusted, unless one
+    does `insist`. Turns of up to `reach` are found. Works on maps of `width`, by default at the shots' own
+    resolution, 1024 at most.
     """
     finest = max(1 / math.sqrt(_pixel(shot.mapping)) for shot in shots)  # pixels a radian
-    width = min(_REFINE_WIDTH, max(128, 8 * round(2 * math.pi * finest / 8)))
+    if width is None:
+        width = min(_REFINE_WIDTH, max(128, 8 * round(2 * math.pi * finest / 8)))
     target = LatLong((width, width // 2))
     world = target.directions()
     lights: list[NDArray[np.float32]] = []
@@ -123,7 +131,9 @@ def refined(
         weight = shot_weight(shot, turn, world) * (placed.coverage > 0.999)
         lights.append(luminance(placed.radiance).astype(np.float32))
         weights.append((weight * (weight > 10 * _MIN_WEIGHT)).astype(np.float32))
-    found = refine_turns(lights, weights)
+    found = refine_turns(lights, weights, reach)
+    if found.reason and not insist:
+        return list(rotations), found
     back = found.turns[fixed].T
     return [back @ t @ r for t, r in zip(found.turns, rotations, strict=True)], found
 

@@ -24,10 +24,11 @@ type Array = NDArray[np.float64]
 type Plane = NDArray[np.float32]
 
 #: Correlation below which an overlap proves nothing, and turns beyond which it is not believed.
-WEAK = 0.6
+WEAK = 0.7
 FARTHEST = math.radians(15)
+REACH = math.radians(12)
 _COARSEST = 360  # pixels across: of a ring 10 degrees wide some pixels remain
-_STEP, _REACH = math.radians(2), math.radians(12)  # the search's grid
+_STEP = math.radians(2)  # the search's grid
 _SAMPLES = 5000
 _CANDIDATES = 16
 _CLEAR = 0.9  # correlation that needs no search
@@ -42,21 +43,27 @@ class Refined:
     ``turns`` (N, 3, 3): what a shot shows at d in its nominal place is at ``turns[n] @ d``.
     ``angles`` (N,) their sizes and ``sigma`` (N,) standard errors of a turn about the worst
     axis, radians; ``correlation`` of local contrast in the overlaps before and after.
-    ``reason`` says why nothing was changed, or is empty.
+    ``significance`` weighs the latter by the overlap's size. ``reason`` says why the turns
+    should not be trusted, or is empty.
     """
 
     turns: Array
     angles: Array
     sigma: Array
     correlation: tuple[float, float]
+    significance: float
     reason: str
 
 
-def refine_turns(luminances: Sequence[Plane], weights: Sequence[Plane]) -> Refined:
+def refine_turns(
+    luminances: Sequence[Plane], weights: Sequence[Plane], reach: float = REACH
+) -> Refined:
     """Refine shots given as lat-long maps (H, W) of luminance and of weight, 0 where unseen.
 
-    A result that is not better than the nominal directions, too uncertain or too far from
-    them is not taken; `reason` then says which.
+    Turns are searched up to `reach` about each axis, radians.
+
+    Turns that are not better than the nominal directions, too uncertain or too far from them
+    have a `reason`.
     """
     count, width = len(luminances), luminances[0].shape[1]
     sizes = [width]
@@ -64,10 +71,12 @@ def refine_turns(luminances: Sequence[Plane], weights: Sequence[Plane]) -> Refin
         sizes.append(sizes[-1] // 2)
     problem = _Problem.of(luminances, weights, sizes[-1])
     if not problem.pairs:
-        return _kept(count, "no two shots overlap")
+        still = np.stack([np.eye(3)] * count)
+        open_ = np.full(count, np.inf)
+        return Refined(still, np.zeros(count), open_, (0.0, 0.0), 0.0, "no two shots overlap")
     turns = problem.solve(np.stack([np.eye(3)] * count))
     if problem.correlation(turns) < _CLEAR:
-        turns = problem.search()
+        turns = problem.search(reach)
     for size in reversed(sizes):
         problem = _Problem.of(luminances, weights, size)
         turns = problem.solve(turns)
@@ -88,19 +97,7 @@ def refine_turns(luminances: Sequence[Plane], weights: Sequence[Plane]) -> Refin
         reason = "the given directions fit as well"
     elif not sigma.max() < max(float(angles.max()), math.radians(0.1)):
         reason = f"the overlap leaves {math.degrees(sigma.max()):.2f} degrees open"
-    if reason:
-        return _kept(count, reason, (before, after), sigma)
-    return Refined(turns, angles, sigma, (before, after), "")
-
-
-def _kept(
-    count: int,
-    reason: str,
-    correlation: tuple[float, float] = (0.0, 0.0),
-    sigma: Array | None = None,
-) -> Refined:
-    open_ = np.full(count, np.inf) if sigma is None else sigma
-    return Refined(np.stack([np.eye(3)] * count), np.zeros(count), open_, correlation, reason)
+    return Refined(turns, angles, sigma, (before, after), problem.significance(turns), reason)
 
 
 @dataclass(frozen=True)
@@ -205,7 +202,7 @@ class _Problem:
         # the gradient was taken in the map's own axes
         return got[:, 0], got[:, 1:4] @ turn.T, got[:, 4]
 
-    def search(self) -> Array:
+    def search(self, reach: float) -> Array:
         """Each shot against the placed one that it shares most with, over a grid of turns."""
         turns = np.stack([np.eye(3)] * len(self.layers))
         placed, waiting = {0}, set(range(1, len(self.layers)))
@@ -227,21 +224,21 @@ class _Problem:
             if not shared:
                 break
             _, i, k = max(shared)
-            turns[k] = turns[i] @ self._best(i, k)
+            turns[k] = turns[i] @ self._best(i, k, reach)
             placed.add(k)
             waiting.remove(k)
         return turns
 
-    def _best(self, i: int, k: int) -> Array:
+    def _best(self, i: int, k: int, reach: float) -> Array:
         """The turn of shot k within reach that correlates best with shot i."""
-        ticks = np.arange(-_REACH, _REACH + _STEP / 2, _STEP)
+        ticks = np.arange(-reach, reach + _STEP / 2, _STEP)
         vectors = np.stack(np.meshgrid(ticks, ticks, ticks, indexing="ij"), axis=-1).reshape(
             -1, 3
         )
         mine, other = self.layers[i], self.layers[k]
         a, b = (np.clip(_blur(layer.signal, 1.5), -0.5, 0.5) for layer in (mine, other))
         near = other.weight > 0
-        for vector in vectors[np.abs(vectors).min(axis=1) > _REACH - _STEP / 2]:
+        for vector in vectors[np.abs(vectors).min(axis=1) > reach - _STEP / 2]:
             near |= self._nearest(other.weight, self.directions @ _turn(vector)) > 0
         usable = np.flatnonzero(near & (mine.weight > 0))
         usable = np.random.default_rng(0).permutation(usable)[:_SAMPLES]

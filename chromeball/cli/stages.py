@@ -547,6 +547,8 @@ class _Planner:
         if masks := [shot.mask for shot in probe.shot if shot.mask]:
             options += ["--mask", *masks]
             inputs += masks
+        if probe.refine_lens:
+            options.append("--refine-lens")
         if not probe.refine and len(merged) > 1:
             options.append("--no-refine")
         if scene.env.ground:
@@ -766,6 +768,8 @@ class _Planner:
 
 
 def _check_probe(probe: Probe) -> None:
+    if probe.refine_lens and (probe.camera or any(shot.ball for shot in probe.shot)):
+        raise UserError("[probe] refine_lens solves for what `lens` says: give that")
     balls = [shot.ball is not None for shot in probe.shot]
     if any(balls) != all(balls):
         raise UserError("[probe]: either all shots are of a ball, or none is")

@@ -134,7 +134,8 @@ class Probe(Table, frozen=True):
 
     ``vignetting``: c1, c2, ... of the fall-off 1 + c1 r^2 + c2 r^4 + ..., r = 1 at the rim of
     the image circle; measured values are divided by it. ``trim``: degrees at the rim of the
-    circle that are left out. ``refine``: turn the shots from what they see together.
+    circle that are left out. ``refine``: turn the shots from what they see together;
+    ``refine_lens``: and solve for the lens' field of view and the circles' centres.
     Of mirror balls: ``camera`` is the one that photographed them (far away without),
     ``reflectance`` is divided by, and ``photographer`` degrees about the direction to the
     camera are left out.
@@ -149,6 +150,7 @@ class Probe(Table, frozen=True):
     vignetting: list[float] = []
     trim: Annotated[float, Meta(ge=0)] = 0.0
     refine: bool = True
+    refine_lens: bool = False
     reflectance: Vector = (1.0, 1.0, 1.0)
     photographer: Annotated[float, Meta(ge=0, lt=120)] = 20.0
     stitch: bool = False

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol, override, runtime_checkable
 
@@ -108,16 +108,19 @@ def of_camera(camera: CameraModel) -> Mapping:
     values = camera.intrinsics
     fx, fy, cx, cy = values[:4] if camera.model == "kb4" else values[[0, 0, 1, 2]]
 
+    # r(theta) goes on beyond the rim, where the formula does: a rim may turn out to lie there
+    whole = camera if camera.model == "kb4" else replace(camera, max_angle=math.pi)
+
     def radius(theta: Array) -> Array:
         d = np.stack([np.sin(theta), np.zeros_like(theta), np.cos(theta)], axis=-1)
         # the sign: at 180 degrees sin theta rounds to either side of zero
-        return np.abs(camera.project(d)[..., 0] - cx) / fx
+        return np.abs(whole.project(d)[..., 0] - cx) / fx
 
     def angle(r: Array) -> Array:
-        d = camera.unproject(np.stack([cx + fx * r, np.full_like(r, cy)], axis=-1))
+        d = whole.unproject(np.stack([cx + fx * r, np.full_like(r, cy)], axis=-1))
         theta = np.arctan2(np.hypot(d[..., 0], d[..., 1]), d[..., 2])
         # rounding at the rim
-        return np.where(np.isfinite(theta), theta, camera.max_angle)
+        return np.where(np.isfinite(theta), theta, whole.max_angle)
 
     return Radial(
         camera.size,

@@ -24,6 +24,7 @@ from chromeball.envmap.probe import (
     without_vignetting,
     world_from_shots,
 )
+from chromeball.envmap.refine_lens import refine_lenses
 from chromeball.scene.camera import WORLD_FROM_LATLONG, CameraModel
 from chromeball.scene.errors import UserError
 
@@ -315,3 +316,36 @@ def test_a_soft_rim_is_trimmed() -> None:
     assert seen == pytest.approx(2 * math.pi * (1 - math.cos(math.radians(92))), rel=0.003)
     with pytest.raises(UserError, match="cannot lose"):
         trimmed(shot, math.radians(60))
+
+
+def test_a_lens_is_refined_from_the_overlap() -> None:
+    """Said to be 190 degrees and centred; it is 201, its circles off by two pixels."""
+    truth = CameraModel.fisheye(
+        "equidistant", (260, 260), math.radians(201), centre=(131.5, 127.5), radius=125.0
+    )
+    said = CameraModel.fisheye(
+        "equidistant", (260, 260), math.radians(190), centre=(129.5, 129.5), radius=125.0
+    )
+    base = WORLD_FROM_LATLONG.rotation
+    poses = [base, rotation(0.02, -0.01, 0.015) @ rotation(math.pi, 0.0, 0.0) @ base]
+    shots = [
+        Shot(detail(of_camera(truth).turned(pose).directions()), of_camera(said), yaw)
+        for pose, yaw in zip(poses, (0.0, math.pi), strict=True)
+    ]
+    found = refine_lenses(shots, world_from_shots(shots))
+    assert math.degrees(found.fov) == pytest.approx(201, abs=0.5)
+    assert abs(math.degrees(found.fov) - 201) < 4 * math.degrees(found.fov_sigma)
+    # a shift of both circles and a turn look alike on the ring: what both give is compared
+    result = combine(found.shots, found.rotations, 256)
+    (overlap,) = result.overlaps
+    assert overlap.spread < 0.1
+    assert found.correlation > 0.95
+
+
+def test_a_lens_without_an_overlap_is_refused() -> None:
+    narrow = of_camera(CameraModel.fisheye("equisolid", (100, 100), math.radians(120)))
+    shots = [Shot(np.ones((100, 100, 3), np.float32), narrow, yaw) for yaw in (0.0, math.pi)]
+    with pytest.raises(UserError, match="cannot be refined"):
+        refine_lenses(shots, world_from_shots(shots))
+    with pytest.raises(UserError, match="two shots"):
+        refine_lenses(shots[:1], world_from_shots(shots[:1]))

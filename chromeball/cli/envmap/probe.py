@@ -50,6 +50,7 @@ class _Request:
     reflectance: list[float]
     trim: float
     refine: bool
+    refine_lens: bool
     ground: list[float] | None
     fill: tuple[Path, Path] | None
     align: Path | None
@@ -80,6 +81,7 @@ def probe(
     trim: float | None = None,
     mask: Annotated[list[Path] | None, Parameter(consume_multiple=True)] = None,
     refine: bool | None = None,
+    refine_lens: Annotated[bool | None, Parameter(negative="")] = None,
     ground: str | None = None,
     fill: str | None = None,
     align: Path | None = None,
@@ -124,6 +126,9 @@ def probe(
         A picture for each shot, white where it may be used.
     refine
         Turn the shots from what they see together; shot `clicked` keeps its place.
+    refine_lens
+        Solve for the lens as well, from the overlap: its field of view and each circle's
+        centre. The record has it as --lens takes it.
     ground
         Complete what lies below the horizon as matt ground of this reflectance, 0.2 or r,g,b.
     fill
@@ -153,7 +158,7 @@ def probe(
             reflectance,
             vignetting,
         ]
-        options += [trim, mask, refine, ground, fill, align, clicked, width]
+        options += [trim, mask, refine, refine_lens, ground, fill, align, clicked, width]
         if any(option is not None for option in options):
             raise UserError("a scene file says everything: leave out the other options")
         _probe_of_scene(shots[0], output, json)
@@ -162,6 +167,8 @@ def probe(
     balls = (
         [parse_numbers(one, "--ball", 3) for one in ball.split()] if ball is not None else []
     )
+    if refine_lens and lens is None:
+        raise UserError("--refine-lens solves for what --lens says: give it")
     if lens is not None and (camera is not None or balls):
         raise UserError("--lens goes with neither --camera nor --ball")
     if lens is None and camera is None and not balls:
@@ -192,6 +199,7 @@ def probe(
             reflectance=_rgb(reflectance, "--reflectance") or [1.0, 1.0, 1.0],
             trim=trim or 0.0,
             refine=refine is not False,
+            refine_lens=refine_lens or False,
             ground=_rgb(ground, "--ground"),
             fill=_fill(fill),
             align=align,
@@ -265,6 +273,7 @@ def _probe_of_scene(path: Path, output: Path, as_json: bool) -> None:
             reflectance=list(entry.reflectance),
             trim=entry.trim,
             refine=entry.refine,
+            refine_lens=entry.refine_lens,
             ground=None if scene.env.ground is None else list(scene.env.ground),
             fill=_fill_of_scene(scene, root),
             align=aligned,
@@ -290,7 +299,8 @@ def _probe(request: _Request, output: Path, as_json: bool) -> None:
     from chromeball.envmap.complete import Source
     from chromeball.envmap.mapping import LatLong
     from chromeball.envmap.picture import read_radiance
-    from chromeball.envmap.probe import combine, refined, world_from_shots
+    from chromeball.envmap.probe import combine, refined, trimmed, world_from_shots
+    from chromeball.envmap.refine_lens import refine_lenses
     from chromeball.scene.record import Stage
 
     check_panorama_width(request.width)
@@ -314,7 +324,18 @@ def _probe(request: _Request, output: Path, as_json: bool) -> None:
             origin = pose.translation
         else:
             rotations, origin = world_from_shots(shots), None
-        if request.refine and len(shots) > 1:
+        if request.refine_lens:
+            solved = refine_lenses(shots, rotations, index)
+            shots, rotations = solved.shots, solved.rotations
+            stage.figures["lens"] = {
+                "fov_degrees": math.degrees(solved.fov),
+                "fov_sigma_degrees": math.degrees(solved.fov_sigma),
+                "centres": solved.centres,
+                "centre_sigma": solved.centre_sigma,
+                "correlation": solved.correlation,
+                "as_option": " ".join(map(_lens_option, request.lenses, shots)),
+            }
+        elif request.refine and len(shots) > 1:
             rotations, found = refined(shots, rotations, index)
             stage.figures["refined"] = {
                 "degrees": np.degrees(found.angles),
@@ -324,6 +345,8 @@ def _probe(request: _Request, output: Path, as_json: bool) -> None:
             }
             if found.reason:
                 print(f"directions kept as given: {found.reason}", file=sys.stderr)
+        if request.trim:
+            shots = [trimmed(shot, math.radians(request.trim)) for shot in shots]
         result = combine(shots, rotations, request.width)
         missing = result.alpha == 0
         if missing.all():
@@ -377,7 +400,7 @@ def _shot(request: _Request, k: int, image: Radiance) -> tuple[Shot, float | Non
 
     from chromeball.envmap.ball import ball_in_circle
     from chromeball.envmap.mapping import Lens, of_camera
-    from chromeball.envmap.probe import Shot, trimmed, without_vignetting
+    from chromeball.envmap.probe import Shot, without_vignetting
 
     file, ball = request.files[k], request.balls[k]
     camera = _camera(request.lenses[k], image.size, file)
@@ -407,12 +430,21 @@ def _shot(request: _Request, k: int, image: Radiance) -> tuple[Shot, float | Non
     try:
         if request.vignetting:
             shot = without_vignetting(shot, request.vignetting)
-        if request.trim:
-            shot = trimmed(shot, math.radians(request.trim))
     except UserError as error:
         raise UserError(error.what, file=file) from error
     bound = None if clipped is None else float(shot.mapping.solid_angles()[clipped].sum())
     return shot, bound
+
+
+def _lens_option(spec: str | Path | None, shot: Shot) -> str:
+    """A solved lens as --lens takes it."""
+    from chromeball.envmap.mapping import Radial
+
+    lens = shot.mapping
+    assert isinstance(lens, Radial)
+    model = str(spec).split(":", 1)[0]
+    (x, y), radius = lens.centre, lens.rim * lens.focal[0]
+    return f"{model}:{2 * math.degrees(lens.max_angle):.4f}:{x:.2f},{y:.2f},{radius:.2f}"
 
 
 def _camera(lens: str | Path | None, size: tuple[int, int], file: Path) -> CameraModel | None:
