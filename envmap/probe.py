@@ -116,8 +116,8 @@ def refined(
     """`rotations` (world_from_shot) improved by what the shots see together.
 
     Shot `fixed` keeps its place; all do where the result is not to be trusted, unless one
-    does `insist`. Turns of up to `reach` are found. Works on maps of `width`, by default at the shots' own
-    resolution, 1024 at most.
+    does `insist`. Turns of up to `reach` radians are found. Works on maps of `width`, by
+    default at the shots' own resolution, 1024 at most.
     """
     finest = max(1 / math.sqrt(_pixel(shot.mapping)) for shot in shots)  # pixels a radian
     if width is None:
