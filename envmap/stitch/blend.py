@@ -124,8 +124,8 @@ def _blend(
     for k, patch in enumerate(patches):
         at = patch.place(width)
         weight = cv2.resize(seams.weights[k], target.size, interpolation=cv2.INTER_LINEAR)[at]
-        # a place that is kept whole has no ghosts of other frames
-        weight = np.where(whole[at] & (labels[at] != k), 0, weight + 1e-7)
+        # a place that is kept whole has no ghosts of other frames, where its own sees it
+        weight = (weight + 1e-7) * np.where(whole[at] & (labels[at] != k), 1e-6, 1)
         weight = (weight * (patch.coverage > 0.5)).astype(np.float32)
         ground[at] += weight[..., None] * np.minimum(patch.radiance, cap)
         total[at] += weight

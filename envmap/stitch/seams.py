@@ -116,6 +116,12 @@ def find_seams(
             moved[grown] = places = places + 1
             if mask is bad:
                 area += float(solid[place].sum())
+    # the rim of a place may lie outside its frame
+    blind = ~np.take_along_axis(seen, np.maximum(labels, 0).astype(np.intp)[None], axis=0)[
+        0
+    ] & seen.any(axis=0)
+    labels[blind] = worth.argmax(axis=0)[blind]
+    moved[blind] = 0
     return Seams(labels, weights, moved, places, torn, area)
 
 

@@ -24,6 +24,7 @@ from chromeball.envmap.stitch.lens import Freedom, fov_of_frame, full_frame, par
 from chromeball.envmap.stitch.orient import Oriented, Prior, orient
 from chromeball.envmap.stitch.photometric import radius2, solve, unchanged
 from chromeball.envmap.stitch.rotations import Matches, adjust, angle_between, exp
+from chromeball.envmap.stitch.seams import find_seams
 from chromeball.scene.camera import WORLD_FROM_LATLONG, CameraModel
 from chromeball.scene.errors import UserError
 from chromeball.scene.image import read_image, write_exr
@@ -294,6 +295,25 @@ def test_what_moved_is_taken_whole_from_one_frame() -> None:
         # whole, or gone
         assert share.mean() > 0.97 or share.mean() < 0.1
     assert result.seams.places >= 1
+    plain = compose(
+        [Frame(str(k), p) for k, p in enumerate(pictures())], LENS, turns(), 512, unchanged(7)
+    )
+    assert ((result.alpha > 0) == (plain.alpha > 0)).all()  # nothing is lost to it
+
+
+def test_a_place_that_its_frame_sees_in_part_has_no_hole() -> None:
+    rng = np.random.default_rng(9)
+    radiance = np.ones((3, 64, 128, 3), np.float32)
+    radiance[1, 20:40, 30:60] = 4.0
+    radiance[2, 22:44, 50:90] = 9.0
+    covered = np.ones((3, 64, 128), np.float32)
+    covered[1, :, 58:] = 0
+    covered[2, :, :48] = 0
+    covered[0, :, 86:] = 0
+    sights = (covered * rng.uniform(0.5, 1, (3, 1, 1))).astype(np.float32)
+    seams = find_seams(radiance, covered, sights, np.zeros((3, 64, 128), np.float32), 1e9)
+    seen = covered > 0.99
+    assert np.take_along_axis(seen, seams.labels[None].astype(np.intp), axis=0).all()
 
 
 # ---- the lens
