@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -92,8 +92,8 @@ def align(
         raise UserError(
             f"corner {k + 1} ({q[k, 0]:g}, {q[k, 1]:g}) lies outside what the lens sees"
         )
-    _check_order(d)
-    rotation = _closed_form(d)
+    check_order(d)
+    rotation = closed_form(d)
     up = rotation[:, 1]
     # camera y points down, so that a camera held upright has up . y < 0
     if not any_plane and up[1] > math.sin(math.radians(10)):
@@ -104,9 +104,9 @@ def align(
     p = -d / (d @ up)[:, None]  # on the plane at height 1
     if ((d @ up) > -1e-9).any():
         raise UserError("a corner lies on or above the horizon of the plane of the others")
-    state = _State.of(rotation, p)
+    state = RectangleState.of(rotation, p)
     state, residuals, jacobian = _fit(state, d)
-    noise = _click_covariance(camera, q, d) * click**2
+    noise = click_covariance(camera, q, d) * click**2
     gain = np.linalg.pinv(jacobian)
     covariance = gain @ noise @ gain.T
     sigma_tilt = float(np.sqrt(covariance[0, 0] + covariance[2, 2]))
@@ -165,19 +165,22 @@ def align(
 
 
 @dataclass(frozen=True)
-class _State:
+class RectangleState:
     """The camera one unit above the plane: camera_from_world, the middle's x and z, sides.
 
-    ``depth`` is signed: positive when the corners run so that it lies along +Z.
+    ``depth`` is signed: positive when the corners run so that it lies along +Z. ``plane``
+    turns the rectangle's own axes (y is its normal) to the world's, for walls and ceilings.
     """
 
     rotation: Array
     middle: Array
     width: float
     depth: float
+    plane: Array = field(default_factory=lambda: np.eye(3))
 
     @classmethod
-    def of(cls, rotation: Array, p: Array) -> _State:
+    def of(cls, rotation: Array, p: Array) -> RectangleState:
+        """From camera_from_rectangle and the corners (4, 3) in the camera's axes."""
         w = p @ rotation  # camera to world axes
         x, z = w[:, 0], w[:, 2]
         return cls(
@@ -193,13 +196,19 @@ class _State:
         z = self.middle[1] + self.depth / 2 * _Z
         return np.stack([x, np.full(4, -1.0), z], axis=1)
 
-    def moved(self, step: Array) -> _State:
+    def moved(self, step: Array) -> RectangleState:
+        """By a rotation vector, then the middle's two, then the sides' changes, (7,)."""
         turn = Pose.from_rotation_vector(step[:3], np.zeros(3)).rotation
-        return _State(
-            self.rotation @ turn,
-            self.middle + step[3:5],
-            float(self.width + step[5]),
-            float(self.depth + step[6]),
+        return self.with_rotation(self.rotation @ turn, step[3:])
+
+    def with_rotation(self, rotation: Array, step: Array) -> RectangleState:
+        """Turned as given, the middle and the sides moved by `step` (4,)."""
+        return replace(
+            self,
+            rotation=rotation,
+            middle=self.middle + step[:2],
+            width=float(self.width + step[2]),
+            depth=float(self.depth + step[3]),
         )
 
 
@@ -207,7 +216,7 @@ _X = np.array([-1.0, 1.0, 1.0, -1.0])
 _Z = np.array([-1.0, -1.0, 1.0, 1.0])
 
 
-def _check_order(d: Array) -> None:
+def check_order(d: Array) -> None:
     """Corners must run once around: all triple products of neighbours have one sign."""
     triples: list[float] = []
     for i in range(4):
@@ -230,17 +239,17 @@ def _check_order(d: Array) -> None:
         )
 
 
-def _closed_form(d: Array) -> Array:
+def closed_form(d: Array) -> Array:
     """camera_from_world from the rays: vanishing directions of both pairs of sides."""
-    v1 = _unit(np.cross(np.cross(d[0], d[1]), np.cross(d[3], d[2])))
-    v2 = _unit(np.cross(np.cross(d[1], d[2]), np.cross(d[0], d[3])))
-    n = _unit(np.cross(v1, v2))
+    v1 = unit(np.cross(np.cross(d[0], d[1]), np.cross(d[3], d[2])))
+    v2 = unit(np.cross(np.cross(d[1], d[2]), np.cross(d[0], d[3])))
+    n = unit(np.cross(v1, v2))
     if d.sum(axis=0) @ n > 0:
         n = -n
     # symmetric orthogonalisation: move both equally until they stand at right angles
     if v1 @ v2 < 0:
         v2 = -v2
-    plus, minus = _unit(v1 + v2), _unit(v1 - v2)
+    plus, minus = unit(v1 + v2), unit(v1 - v2)
     x = (plus + minus) / math.sqrt(2)
     height = np.where(np.abs(d @ n) < 1e-12, np.nan, d @ n)
     p = -d / height[:, None]
@@ -249,21 +258,14 @@ def _closed_form(d: Array) -> Array:
     return np.stack([x, n, np.cross(x, n)], axis=1)
 
 
-def _fit(state: _State, d: Array) -> tuple[_State, Array, Array]:
+def _fit(state: RectangleState, d: Array) -> tuple[RectangleState, Array, Array]:
     """Gauss-Newton with halved steps on the angles between rays and corners, 8 against 7."""
-    tangents = np.stack([_tangents(ray) for ray in d])  # (4, 3, 2)
+    bases = np.stack([tangents(ray) for ray in d])  # (4, 3, 2)
 
-    def residuals(s: _State) -> Array:
-        c = s.corners() @ s.rotation.T
-        c = c / np.linalg.norm(c, axis=1, keepdims=True)
-        off = np.einsum("ijk,ij->ik", tangents, c)
-        sine = np.linalg.norm(off, axis=1)
-        angle = np.arctan2(sine, np.sum(c * d, axis=1))
-        return (
-            off * np.where(sine > 0, angle / np.where(sine > 0, sine, 1), 1)[:, None]
-        ).ravel()
+    def residuals(s: RectangleState) -> Array:
+        return rectangle_angles(s, d)
 
-    def jacobian(s: _State) -> Array:
+    def jacobian(s: RectangleState) -> Array:
         # of the unit corner, which is the angle's to first order
         w = s.corners()
         c = w @ s.rotation.T
@@ -278,7 +280,7 @@ def _fit(state: _State, d: Array) -> tuple[_State, Array, Array]:
         dc = (dc - unit[:, :, None] * np.einsum("ni,nik->nk", unit, dc)[:, None, :]) / norm[
             :, None, None
         ]
-        return np.einsum("nij,nik->njk", tangents, dc).reshape(8, 7)
+        return np.einsum("nij,nik->njk", bases, dc).reshape(8, 7)
 
     r = residuals(state)
     for _ in range(50):
@@ -296,24 +298,36 @@ def _fit(state: _State, d: Array) -> tuple[_State, Array, Array]:
     return state, r, jacobian(state)
 
 
-def _click_covariance(camera: CameraModel, q: Array, d: Array) -> Array:
+def rectangle_angles(state: RectangleState, d: Array) -> Array:
+    """Angles (8,) from the rays `d` (4, 3) to the corners, along both tangents of each."""
+    bases = np.stack([tangents(ray) for ray in d])
+    c = state.corners() @ state.rotation.T
+    c = c / np.linalg.norm(c, axis=1, keepdims=True)
+    off = np.einsum("ijk,ij->ik", bases, c)
+    sine = np.linalg.norm(off, axis=1)
+    angle = np.arctan2(sine, np.sum(c * d, axis=1))
+    return (off * np.where(sine > 0, angle / np.where(sine > 0, sine, 1), 1)[:, None]).ravel()
+
+
+def click_covariance(camera: CameraModel, q: Array, d: Array) -> Array:
     """Covariance of the eight angles for one pixel of noise, by the camera's Jacobian."""
     _, dq_dd = camera.project_with_jacobian(d)
     covariance = np.zeros((8, 8))
     for k in range(4):
-        inverse = np.linalg.pinv(dq_dd[k] @ _tangents(d[k]))  # d angle / d pixel
+        inverse = np.linalg.pinv(dq_dd[k] @ tangents(d[k]))  # d angle / d pixel
         covariance[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = inverse @ inverse.T
     return covariance
 
 
-def _tangents(d: Array) -> Array:
+def tangents(d: Array) -> Array:
     """Two unit vectors at right angles to d, (3, 2)."""
     side = np.eye(3)[int(np.argmin(np.abs(d)))]
-    a = _unit(np.asarray(np.cross(d, side), float))
+    a = unit(np.asarray(np.cross(d, side), float))
     return np.stack([a, np.cross(d, a)], axis=1)
 
 
-def _unit(v: Array) -> Array:
+def unit(v: Array) -> Array:
+    """Of length 1; refuses what has none."""
     norm = float(np.linalg.norm(v))
     if norm < 1e-12:
         raise UserError("the corners are on one line: they are no rectangle")
@@ -353,72 +367,3 @@ def read_alignment(path: str | os.PathLike[str]) -> tuple[Pose, str | None]:
         return Pose.from_matrix(matrix), value.get("picture")
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise UserError(f"not an align.json: {error}", file=path) from error
-
-
-# ---- drawn back over the picture
-
-
-def overlay(
-    display: NDArray[np.uint8], camera: CameraModel, alignment: Alignment, points: ArrayLike
-) -> NDArray[np.uint8]:
-    """Horizon (yellow), floor grid (grey), axes X Y Z (red, green, blue), clicks (magenta).
-
-    `display` (H, W, 3) uint8 is the picture that was clicked in.
-    """
-    import cv2
-
-    picture = np.array(display, np.uint8, order="C")
-    thickness = max(1, round(max(camera.size) / 700))
-    posed = camera.posed(alignment.world_from_camera)
-    origin = alignment.world_from_camera.translation
-    width, height = camera.size
-
-    def line(world: Array, color: tuple[int, int, int], weight: int = thickness) -> None:
-        q = posed.project_world(world)
-        inside = np.isfinite(q).all(axis=1)
-        for a, b, ok in zip(q[:-1], q[1:], inside[:-1] & inside[1:], strict=True):
-            if ok and np.abs(a - b).max() < max(width, height) / 8:
-                start, end = (
-                    (round(float(p[0]) * 16), round(float(p[1]) * 16)) for p in (a, b)
-                )
-                cv2.line(picture, start, end, color, weight, cv2.LINE_AA, 4)
-
-    t = np.linspace(0, 1, 200)[:, None]
-    half = max(alignment.width, alignment.depth) * 2
-    for k in np.linspace(-1, 1, 9):
-        for i, j in ((0, 2), (2, 0)):
-            a = np.zeros((200, 3))
-            a[:, i], a[:, j] = (2 * t[:, 0] - 1) * half, k * half
-            line(a, (110, 110, 110), 1)
-    phi = np.linspace(0, 2 * math.pi, 721)
-    ring = np.stack([np.cos(phi), np.zeros_like(phi), np.sin(phi)], axis=1)
-    line(origin + 1e6 * ring, (255, 220, 0))
-    for axis, color in zip(
-        np.eye(3), ((255, 60, 60), (60, 220, 60), (80, 120, 255)), strict=True
-    ):
-        line(t * axis * half / 2, color, 2 * thickness)
-    line(
-        np.concatenate(
-            [
-                a + (b - a) * t
-                for a, b in zip(
-                    alignment.corners, np.roll(alignment.corners, -1, axis=0), strict=True
-                )
-            ]
-        ),
-        (255, 0, 255),
-    )
-    for number, p in enumerate(np.asarray(points, float), 1):
-        centre = (round(float(p[0])), round(float(p[1])))
-        cv2.circle(picture, centre, 4 * thickness, (255, 0, 255), thickness, cv2.LINE_AA)
-        cv2.putText(
-            picture,
-            str(number),
-            (centre[0] + 6 * thickness, centre[1] - 6 * thickness),
-            cv2.FONT_HERSHEY_SIMPLEX,
-            0.5 * thickness,
-            (255, 0, 255),
-            thickness,
-            cv2.LINE_AA,
-        )
-    return np.asarray(picture, np.uint8)

@@ -18,7 +18,7 @@ import msgspec
 
 from chromeball.renderer.inputs import scene_inputs
 from chromeball.scene.errors import UserError
-from chromeball.scene.manifest import Bracket, Lens, Meter, Probe, Quad, Scene, View
+from chromeball.scene.manifest import Align, Bracket, Lens, Meter, Probe, Quad, Scene, View
 from chromeball.scene.sequence import at, frames_of, moves
 
 # the suffixes of `chromeball.scene.image`, which is too heavy to import for a plan
@@ -157,8 +157,10 @@ class _Planner:
             if view.points and not (view.bracket or view.plate):
                 raise UserError(f"view {view.name!r} has points but no photograph")
         for view in self.plates:
-            if view.points and not scene.align:
-                raise UserError(f"view {view.name!r} has points but there is no [align]")
+            if view.points and not (scene.align and scene.align.points):
+                raise UserError(
+                    f"view {view.name!r} has points but there is no [align] with a rectangle"
+                )
             if not view.points and not view.camera:
                 raise UserError(
                     f"view {view.name!r} has a photograph but nothing says from where: give "
@@ -497,7 +499,7 @@ class _Planner:
         return StagePlan(
             name,
             True,
-            f"world axes and scale from four points of {align.picture}",
+            f"world axes and scale from {_clicked(align)} of {align.picture}",
             tuple(inputs),
             (output,),
             ("chromeball", "envmap", "align", self.file, "-o", output),
@@ -804,6 +806,18 @@ def _numbers(values: Sequence[float]) -> str:
 def points_text(points: Quad) -> str:
     """``"x,y x,y x,y x,y"``."""
     return " ".join(f"{x:.10g},{y:.10g}" for x, y in points)
+
+
+def _clicked(align: Align) -> str:
+    """What the axes are found from."""
+    counts = (
+        ("four points", align.points is not None),
+        (f"{len(align.verticals)} verticals", bool(align.verticals)),
+        ("the horizon", bool(align.horizon)),
+        ("the sun", align.sun is not None),
+        ("north", align.north is not None),
+    )
+    return ", ".join(name for name, there in counts if there)
 
 
 def _option(name: str, value: str) -> tuple[str, ...]:

@@ -173,19 +173,46 @@ class Probe(Table, frozen=True):
 
 
 class Align(Table, frozen=True):
-    """World axes and scale from the four corners of a rectangle on the floor.
+    """World axes and scale from the four corners of a rectangle, and from what else is clicked.
 
     ``picture``: the name of the probe shot's bracket that the points were clicked in, or
     ``env`` for a finished panorama. ``width`` is the length from the first corner to the
     second, ``depth`` from the second to the third; one of them or ``camera_height`` in metres.
     The world's origin is the middle of the rectangle, +X runs along its width, +Y is up.
+
+    Beside the rectangle, on a ``plane``, or in its place: ``verticals``, pairs of points, the
+    lower first; ``horizon``, points of it; ``sun``, a point, with ``time`` (ISO 8601 with its
+    zone), ``latitude`` and ``longitude`` in degrees; ``north``, a point of that ``bearing``.
+    Without a rectangle +X is east and the origin on the floor below the camera.
     """
 
-    points: Quad
     picture: str
+    points: Quad | None = None
+    plane: Literal["floor", "ceiling", "wall"] = "floor"
     width: Positive | None = None
     depth: Positive | None = None
     camera_height: Positive | None = None
+    verticals: list[tuple[Point, Point]] = []
+    horizon: list[Point] = []
+    sun: Point | None = None
+    time: str | None = None
+    latitude: float | None = None
+    longitude: float | None = None
+    north: Point | None = None
+    bearing: float = 0.0
+
+    def __post_init__(self) -> None:
+        place = (self.time, self.latitude, self.longitude)
+        if (self.sun is None) != all(value is None for value in place) or (
+            self.sun is not None and None in place
+        ):
+            raise ValueError("sun, time, latitude and longitude are given together")
+        if self.bearing and self.north is None:
+            raise ValueError("bearing is for north, and there is none")
+        if self.points is None and (self.width or self.depth or self.plane != "floor"):
+            raise ValueError("width, depth and plane are for points, and there are none")
+        if self.points is None and self.sun is None and self.north is None:
+            raise ValueError("points, sun or north: one of them gives the heading")
 
 
 class Env(Table, frozen=True):

@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from chromeball.envmap.align import align, alignment_json, overlay, read_alignment
+from chromeball.envmap.align import align, alignment_json, read_alignment
+from chromeball.envmap.overlay import Drawn, overlay
 from chromeball.scene.camera import CameraModel
 from chromeball.scene.errors import UserError
 from chromeball.scene.pose import Pose
@@ -216,7 +217,7 @@ def test_bad_lengths(width: float | None, depth: float | None) -> None:
 def test_overlay_and_file(tmp_path: Path) -> None:
     result = align(PANORAMA, GOOD, width=1.0)
     picture = np.full((1024, 2048, 3), 90, np.uint8)
-    drawn = overlay(picture, PANORAMA, result, GOOD)
+    drawn = overlay(picture, PANORAMA, result.world_from_camera, Drawn(result.corners, GOOD))
     assert drawn.shape == picture.shape
     # the horizon passes where the direction is level
     level = PANORAMA.posed(result.world_from_camera).project_world(

@@ -6,8 +6,9 @@ import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+import msgspec
 from cyclopts import Parameter
 
 from chromeball.cli.envmap.arguments import (
@@ -15,6 +16,7 @@ from chromeball.cli.envmap.arguments import (
     Out,
     lens_of,
     need_size,
+    parse_numbers,
     parse_points,
     parse_size,
     picture_size,
@@ -33,6 +35,15 @@ def align(
     /,
     *,
     points: str | None = None,
+    plane: Literal["floor", "ceiling", "wall"] = "floor",
+    verticals: str | None = None,
+    horizon: str | None = None,
+    sun: str | None = None,
+    time: str | None = None,
+    latitude: float | None = None,
+    longitude: float | None = None,
+    north: str | None = None,
+    bearing: float | None = None,
     picture: Path | None = None,
     lens: str | None = None,
     camera: Path | None = None,
@@ -45,14 +56,35 @@ def align(
     output: Out,
     json: Json = False,
 ) -> None:
-    """World axes and scale from the four corners of a rectangle on the floor.
+    """World axes and scale from a rectangle, verticals, the horizon, the sun, a bearing.
+
+    Any mix of them is solved at once; what contradicts the others is named. Without a rectangle
+    +X is east, and the origin lies on the floor below the camera.
 
     Parameters
     ----------
     scene
         A scene file: its [align] and [probe] say everything.
     points
-        The corners in order around the rectangle, pixels, "x,y x,y x,y x,y".
+        A rectangle's corners in order around it, pixels, "x,y x,y x,y x,y".
+    plane
+        Where the rectangle lies.
+    verticals
+        Points of vertical edges two by two, the lower first, "x,y x,y  x,y x,y".
+    horizon
+        Points of the horizon, "x,y x,y".
+    sun
+        Where the sun is, x,y; needs --time, --latitude and --longitude.
+    time
+        ISO 8601 with its zone, 2026-06-21T14:30+02:00.
+    latitude
+        Degrees north.
+    longitude
+        Degrees east.
+    north
+        A point to the north, x,y, or at --bearing; any point may be called north.
+    bearing
+        Degrees clockwise from north.
     picture
         The picture that was clicked in: gives the size, and the check is drawn over it.
     lens
@@ -70,7 +102,7 @@ def align(
     click
         Noise of a click in pixels, for the standard errors.
     any_plane
-        Allow a rectangle on a wall or a ceiling.
+        Allow a rectangle on a wall or a ceiling, and take its plane for the floor's.
     output
         The axes, align.json.
     json
@@ -80,17 +112,19 @@ def align(
     from chromeball.scene.camera import CameraModel
 
     if scene is not None:
-        given = (points, picture, lens, camera, size, width, depth, camera_height)
-        if any(value is not None for value in given):
+        texts = (points, verticals, horizon, sun, time, latitude, longitude, north, bearing)
+        given = (*texts, picture, lens, camera, size, width, depth, camera_height)
+        if any(value is not None for value in given) or any_plane or plane != "floor":
             raise UserError("a scene file says everything: leave out the other options")
         model, entry, shown, inputs = _align_of_scene(scene)
         name: str | None = entry.picture
-        clicks = [list(point) for point in entry.points]
-        width, depth, camera_height = entry.width, entry.depth, entry.camera_height
     else:
-        if points is None:
-            raise UserError("give a scene file, or --points with --lens or --camera")
-        clicks = parse_points(points)
+        entry = _typed(
+            points, plane, verticals, horizon, sun, time, latitude, longitude, north, bearing
+        )
+        entry = msgspec.structs.replace(
+            entry, width=width, depth=depth, camera_height=camera_height
+        )
         extent = parse_size(size) if size is not None else picture_size(picture)
         if (lens is None) == (camera is None):
             raise UserError("give --lens or --camera, one of the two")
@@ -110,45 +144,102 @@ def align(
         name = picture.stem if picture else None
         inputs = [path for path in (picture, camera) if path is not None]
     try:
-        _align(
-            (model, clicks, name, shown),
-            (width, depth, camera_height),
-            click,
-            any_plane,
-            inputs,
-            output,
-            json,
-        )
+        if not 0 < click < 1000:
+            raise UserError(f"--click {click:g}: pixels, more than 0")
+        if _is_floor_alone(entry):
+            _align_rectangle(model, entry, name, shown, click, any_plane, inputs, output, json)
+        else:
+            if any_plane:
+                raise UserError("--any-plane is for a rectangle alone; say --plane")
+            _align_mix(model, entry, name, shown, click, inputs, output, json)
     except UserError as error:
         raise (
             error if error.file or scene is None else UserError(error.what, file=scene)
         ) from error
 
 
-def _align(
-    clicked: tuple[CameraModel, list[list[float]], str | None, Path | None],
-    lengths: tuple[float | None, float | None, float | None],
+def _typed(
+    points: str | None,
+    plane: Literal["floor", "ceiling", "wall"],
+    verticals: str | None,
+    horizon: str | None,
+    sun: str | None,
+    time: str | None,
+    latitude: float | None,
+    longitude: float | None,
+    north: str | None,
+    bearing: float | None,
+) -> Align:
+    """What was typed as the scene file's table."""
+    from chromeball.scene.manifest import Align
+
+    if points is None and verticals is None and horizon is None and not (sun or north):
+        raise UserError("give a scene file, or --points with --lens or --camera")
+    corners = parse_points(points) if points is not None else None
+    edges = _pixels(verticals, "--verticals")
+    if len(edges) % 2:
+        raise UserError(f"--verticals: points two by two, not {len(edges)}")
+    if bearing is not None and north is None:
+        raise UserError("--bearing is for --north")
+    if (sun is None) != (time is None) or (sun is None) != (latitude is None):
+        raise UserError("--sun, --time, --latitude and --longitude are given together")
+    if (latitude is None) != (longitude is None):
+        raise UserError("--sun, --time, --latitude and --longitude are given together")
+    value = {
+        "picture": "",
+        "points": corners,
+        "plane": plane,
+        "verticals": [[edges[i], edges[i + 1]] for i in range(0, len(edges), 2)],
+        "horizon": _pixels(horizon, "--horizon"),
+        "sun": parse_numbers(sun, "--sun", 2) if sun is not None else None,
+        "time": time,
+        "latitude": latitude,
+        "longitude": longitude,
+        "north": parse_numbers(north, "--north", 2) if north is not None else None,
+        "bearing": bearing or 0.0,
+    }
+    try:
+        return msgspec.convert(value, Align)
+    except msgspec.ValidationError as error:
+        raise UserError(str(error)) from error
+
+
+def _pixels(text: str | None, option: str) -> list[list[float]]:
+    return [parse_numbers(pair, option, 2) for pair in (text or "").split()]
+
+
+def _is_floor_alone(entry: Align) -> bool:
+    others = (entry.verticals, entry.horizon, entry.sun, entry.north)
+    return not any(others) and entry.plane == "floor"
+
+
+def _align_rectangle(
+    model: CameraModel,
+    entry: Align,
+    name: str | None,
+    shown: Path | None,
     click: float,
     any_plane: bool,
     inputs: Sequence[Path],
     output: Path,
     as_json: bool,
 ) -> None:
-    from chromeball.envmap.align import align, alignment_json, overlay
+    import numpy as np
+
+    from chromeball.envmap.align import align, alignment_json
+    from chromeball.envmap.overlay import Drawn, overlay
     from chromeball.envmap.picture import write_preview
     from chromeball.scene.record import Stage, write_json
 
-    model, clicks, name, shown = clicked
-    width, depth, camera_height = lengths
-    if not 0 < click < 1000:
-        raise UserError(f"--click {click:g}: pixels, more than 0")
+    assert entry.points is not None
+    clicks = [list(point) for point in entry.points]
     with Stage("envmap align", inputs) as stage:
         result = align(
             model,
             clicks,
-            width=width,
-            depth=depth,
-            camera_height=camera_height,
+            width=entry.width,
+            depth=entry.depth,
+            camera_height=entry.camera_height,
             click=click,
             any_plane=any_plane,
         )
@@ -166,10 +257,109 @@ def _align(
             "warnings": result.warnings,
         }
         if shown is not None:
-            drawn = overlay(_display(shown), model, result, clicks)
+            drawn = overlay(
+                _display(shown),
+                model,
+                result.world_from_camera,
+                Drawn(corners=result.corners, points=np.array(clicks)),
+            )
             stage.figures["overlay"] = write_preview(output, "overlay", drawn)
         with stage.output(output) as temporary:
             write_json(temporary, alignment_json(result, name, clicks))
+    print_figures(stage.figures, as_json, output)
+
+
+def _align_mix(
+    model: CameraModel,
+    entry: Align,
+    name: str | None,
+    shown: Path | None,
+    click: float,
+    inputs: Sequence[Path],
+    output: Path,
+    as_json: bool,
+) -> None:
+    import numpy as np
+
+    from chromeball.envmap.axes import (
+        Bearing,
+        Horizon,
+        Observation,
+        Rectangle,
+        Vertical,
+        axes_json,
+        solve_axes,
+    )
+    from chromeball.envmap.overlay import Drawn, overlay
+    from chromeball.envmap.picture import write_preview
+    from chromeball.envmap.sun_position import parse_time, sun_position
+    from chromeball.scene.record import Stage, write_json
+
+    observed: list[Observation] = []
+    corners = None if entry.points is None else np.array(entry.points)
+    if corners is not None:
+        observed.append(Rectangle(corners, entry.plane, entry.width, entry.depth))
+    observed += [Vertical(np.array(edge)) for edge in entry.verticals]
+    observed += [Horizon(np.array(point)) for point in entry.horizon]
+    stands = None
+    if entry.sun is not None:
+        assert entry.time is not None
+        assert entry.latitude is not None
+        assert entry.longitude is not None
+        stands = sun_position(parse_time(entry.time), entry.latitude, entry.longitude)
+        observed.append(Bearing(np.array(entry.sun), stands.azimuth, stands.elevation))
+    if entry.north is not None:
+        observed.append(Bearing(np.array(entry.north), math.radians(entry.bearing)))
+    with Stage("envmap align", inputs) as stage:
+        result = solve_axes(model, observed, camera_height=entry.camera_height, click=click)
+        for warning in result.warnings:
+            print(f"warning: {warning}", file=sys.stderr)
+        stage.figures |= {
+            "width": result.width,
+            "depth": result.depth,
+            "camera_height": result.camera_height,
+            "north_degrees": None if result.north is None else math.degrees(result.north),
+            "sun_degrees": None
+            if stands is None
+            else [math.degrees(stands.azimuth), math.degrees(stands.elevation)],
+            "residual_degrees": math.degrees(result.residual),
+            "sigma_tilt_degrees": math.degrees(result.sigma_tilt),
+            "sigma_yaw_degrees": math.degrees(result.sigma_yaw),
+            "sigma_height": result.sigma_height,
+            "chi_square_over_freedom": [result.chi_square, result.freedom],
+            "observations": [
+                {
+                    "name": term.name,
+                    "residual_degrees": math.degrees(term.residual),
+                    "sigma_degrees": math.degrees(term.sigma),
+                    "used": term.used,
+                }
+                for term in result.terms
+            ],
+            "warnings": result.warnings,
+        }
+        if shown is not None:
+            drawn = overlay(
+                _display(shown),
+                model,
+                result.world_from_camera,
+                Drawn(
+                    corners=result.corners,
+                    points=corners,
+                    verticals=[np.array(edge) for edge in entry.verticals],
+                    marks=[
+                        *[("horizon", np.array(point)) for point in entry.horizon],
+                        *([("sun", np.array(entry.sun))] if entry.sun else []),
+                        *([("north", np.array(entry.north))] if entry.north else []),
+                    ],
+                    sun=None if stands is None else (stands.azimuth, stands.elevation),
+                    north=result.north,
+                ),
+            )
+            stage.figures["overlay"] = write_preview(output, "overlay", drawn)
+        with stage.output(output) as temporary:
+            points = None if entry.points is None else [list(p) for p in entry.points]
+            write_json(temporary, axes_json(result, name, points))
     print_figures(stage.figures, as_json, output)
 
 
