@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from bench.envmap_align import rows as align_rows
 from bench.envmap_lights import rows as lights_rows
 from bench.envmap_stitch import rows as stitch_rows
 from bench.row import Row
@@ -50,7 +51,7 @@ def rows(quick: bool) -> list[Row]:
     result: list[Row] = []
     for what, source, target in tasks:
         result += _task(what, source, target)
-    return result + lights_rows(quick) + stitch_rows(quick)
+    return result + lights_rows(quick) + stitch_rows(quick) + align_rows(quick)
 
 
 def _task(what: str, source: Mapping, target: Mapping) -> list[Row]:

@@ -35,7 +35,8 @@ DEEDS = {
     "Debevec and Malik (1997).",
     "hdr merge": "The frames of a bracket merged to scene-linear radiance.",
     "calibrate lens": "Intrinsics and distortion of the lens, from photographs of a target.",
-    "envmap align": "World axes and scale from the corners of a rectangle on the floor.",
+    "envmap align": "World axes and scale from what was clicked: a rectangle, verticals, the "
+    "horizon, the sun.",
     "envmap probe": "The shots of the light probe resampled to one lat-long map in world axes.",
     "envmap stitch": "Frames of several directions as one map: where each looked is found from "
     "what they have in common, exposures are made equal, moving things come from one frame.",
