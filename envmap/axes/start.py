@@ -53,8 +53,8 @@ def starts_of(camera: CameraModel, observations: Sequence[Observation]) -> list[
     else:
         ups = [(u, None, None) for u in _likely_ups(camera, observations)]
     starts: list[State] = []
-    for up, turn, state in ups:
-        north = 0.0
+    for up, found, lying in ups:
+        turn, north = found, 0.0
         if bearing is not None:
             d = camera.unproject(np.atleast_2d(bearing.point))[0]
             if turn is None:
@@ -69,7 +69,7 @@ def starts_of(camera: CameraModel, observations: Sequence[Observation]) -> list[
                 w = d @ turn
                 north = bearing.azimuth - math.atan2(w[0], -w[2])
         assert turn is not None
-        starts.append(State(turn, north, state))
+        starts.append(State(turn, north, lying))
     return starts
 
 
