@@ -16,26 +16,29 @@ class Fast {
         special_(std::size_t(across_ * ((from_.height >> kTile) + 1))) {
     for (std::size_t k = 0; k < count; ++k)
       mark(hot[k] % from_.width, hot[k] / from_.width);
-    if (source.solid.across == 0 && !source.valid) return;
+    if (!source.solid.holes && !source.valid) return;
     for (int y = 0; y < from_.height; ++y)
       for (int x = 0; x < from_.width; ++x)
         if (!source.usable({x, y})) mark(x, y);
   }
 
   // The base of all rows, and the sums of each row, (H, 3).
-  void gather(const Projection& to, Solid solid, const Matrix& source_from_target,
+  void gather(const Projection& to, const Solid& solid, const Matrix& source_from_target,
               const Band& band) const {
     for_rows(0, to.height, [&](int y) {
       thread_local Rays rays;
       thread_local Places places;
       thread_local float u[kBatch], v[kBatch];
-      double* sums = band.energy + 3 * Index(y);
+      thread_local std::vector<float> solids;
+      solids.resize(std::size_t(to.width));
+      solid.row(y, solids.data());
+      double* sums = band.energy + 4 * Index(y);
       constexpr int batch = 128;
       for (int first = 0; first < to.width; first += batch) {
         const int n = std::min(batch, to.width - first);
         const Index row = Index(y) * to.width + first;
-        const float* omega = solid.values + y * solid.down + first * solid.across;
-        if (solid.across && std::all_of(omega, omega + n, [](float o) { return !(o > 0); })) {
+        const float* omega = solids.data() + first;
+        if (!solid.even && std::all_of(omega, omega + n, [](float o) { return !(o > 0); })) {
           std::fill_n(band.radiance + 3 * row, 3 * n, 0.f);  // beside the cross, around the disc
           std::fill_n(band.coverage + row, n, 0.f);
           continue;
@@ -46,8 +49,7 @@ class Fast {
         if (to.kind == Projection::Kind::radial) std::fill_n(rays.jacobian, n, 1.f);
         rays.turn(source_from_target, n);
         from_.project(rays, n, places);
-        look(rays, places, n, omega, solid.across, band.radiance + 3 * row,
-             band.coverage + row, sums);
+        look(rays, places, n, omega, band.radiance + 3 * row, band.coverage + row, sums);
       }
     });
   }
@@ -77,7 +79,7 @@ class Fast {
     return *reinterpret_cast<const Loose*>(p);
   }
 
-  void look(const Rays& rays, const Places& p, int n, const float* solid, Index across, float* out,
+  void look(const Rays& rays, const Places& p, int n, const float* solid, float* out,
             float* coverage, double* sums) const {
     float s[kBatch], t[kBatch];
     std::int32_t column[kBatch], line[kBatch], inner[kBatch];
@@ -103,7 +105,7 @@ class Fast {
     Float4 total{};
     for (int k = 0; k < n; ++k) {
       Float4 value{};
-      const float omega = solid[k * across];
+      const float omega = solid[k];
       if (inner[k] && omega > 0 &&
           !special_[std::size_t((line[k] >> kTile) * across_ + (column[k] >> kTile))]) {
         const float* above = source_.rgb + stride * line[k] + 3 * Index(column[k]);

@@ -6,6 +6,8 @@
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/tuple.h>
 
+#include <numeric>
+
 #include "fast.h"
 #include "survey.h"
 #include "warp.h"
@@ -19,6 +21,8 @@ using Table = nb::ndarray<const float, nb::c_contig, nb::device::cpu>;
 using Rgb = nb::ndarray<const float, nb::shape<-1, -1, 3>, nb::c_contig, nb::device::cpu>;
 using Mask = nb::ndarray<const bool, nb::shape<-1, -1>, nb::c_contig, nb::device::cpu>;
 using Plane = nb::ndarray<const float, nb::shape<-1, -1>, nb::c_contig, nb::device::cpu>;
+using Lines = nb::ndarray<const std::int64_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+using Columns = nb::ndarray<const std::int32_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 using Turn = nb::ndarray<const double, nb::shape<3, 3>, nb::c_contig, nb::device::cpu>;
 using Doubles = nb::ndarray<const double, nb::shape<-1, -1>, nb::c_contig, nb::device::cpu>;
 using Result = nb::ndarray<nb::numpy, double, nb::ndim<2>>;
@@ -38,12 +42,71 @@ bool fits(const auto& array, const Projection& p) {
   return array.shape(0) == std::size_t(p.height) && array.shape(1) == std::size_t(p.width);
 }
 
-// (H, W), or (H, 1) where a row is all the same.
-Solid solid_of(const Plane& plane, const Projection& p) {
-  if (plane.shape(0) != std::size_t(p.height) ||
-      (plane.shape(1) != std::size_t(p.width) && plane.shape(1) != 1))
-    throw nb::value_error("solid angles and map differ in size");
-  return {plane.data(), plane.shape(1) == 1 ? 0 : 1, Index(plane.shape(1))};
+// Solid angles with their table; it keeps the arrays alive.
+class SolidAngles {
+ public:
+  SolidAngles(const Projection& map, Plane values, Lines lines, Columns columns)
+      : map_(map),
+        values_(values),
+        columns_(columns),
+        begin_(lines.data(), lines.data() + lines.size()),
+        solid_{map_, values_.data(), begin_.data(), columns_.data(), values_.shape(1) == 1, false} {
+    const auto outside = [](const auto& a, std::size_t n) {
+      return std::any_of(a.data(), a.data() + a.size(),
+                         [&](auto k) { return k < 0 || std::size_t(k) >= n; });
+    };
+    if (lines.size() != std::size_t(map.height) || columns.size() != std::size_t(map.width) ||
+        outside(lines, values.shape(0)) || outside(columns, values.shape(1)))
+      throw nb::value_error("solid angles and map differ in size");
+    for (auto& k : begin_) k *= std::int64_t(values.shape(1));
+    solid_.holes = std::any_of(values.data(), values.data() + values.size(),
+                               [](float v) { return !(v > 0); });
+  }
+  SolidAngles(const SolidAngles&) = delete;
+  SolidAngles& operator=(const SolidAngles&) = delete;
+  const Solid& operator*() const { return solid_; }
+  const Projection& map() const { return map_; }
+
+  // Rows of the picture, (last - first, W).
+  auto rows(int first, int last) const {
+    if (first < 0 || last > map_.height || first > last) throw nb::value_error("no such rows");
+    float* out;
+    const std::size_t w = std::size_t(map_.width);
+    auto result = make_array<float, Out<2>>({std::size_t(last - first), w}, out);
+    nb::gil_scoped_release release;
+    for_rows(first, last, [&](int y) { solid_.row(y, out + w * std::size_t(y - first)); });
+    return result;
+  }
+
+  // Their sum.
+  double total() const {
+    std::vector<double> sums(static_cast<std::size_t>(map_.height));
+    nb::gil_scoped_release release;
+    for_rows(0, map_.height, [&](int y) {
+      thread_local std::vector<float> row;
+      row.resize(std::size_t(map_.width));
+      solid_.row(y, row.data());
+      double sum = 0;
+#pragma omp simd reduction(+ : sum)
+      for (Index x = 0; x < map_.width; ++x) sum += double(row.data()[x]);
+      sums[std::size_t(y)] = sum;
+    });
+    return std::accumulate(sums.begin(), sums.end(), 0.0);
+  }
+
+ private:
+  Projection map_;
+  Plane values_;
+  Columns columns_;
+  std::vector<std::int64_t> begin_;
+  Solid solid_;
+};
+
+Source source_of(const Rgb& rgb, const std::optional<Mask>& valid, const SolidAngles& solid,
+                 float cap) {
+  if (!fits(rgb, solid.map()) || (valid && !fits(*valid, solid.map())))
+    throw nb::value_error("arrays and solid angles differ in size");
+  return {solid.map(), rgb.data(), valid ? valid->data() : nullptr, *solid, cap};
 }
 
 Matrix matrix_of(const Turn& turn) {
@@ -56,29 +119,25 @@ Matrix matrix_of(const Turn& turn) {
 // A resampling under way; it keeps the arrays that it looks at alive.
 class Resampling {
  public:
-  Resampling(Rgb rgb, std::optional<Mask> valid, Plane source_solid, Plane target_solid,
-             std::optional<Rgb> variance, const Projection& from, const Projection& to,
-             const Turn& source_from_target, float cap, float typical, bool smooth)
+  Resampling(Rgb rgb, std::optional<Mask> valid, std::optional<Rgb> variance,
+             const SolidAngles& source, const SolidAngles& target, const Turn& source_from_target,
+             float cap, float typical, bool smooth)
       : rgb_(rgb),
         valid_(valid),
-        source_solid_(source_solid),
-        target_solid_(target_solid),
         variance_(variance),
-        from_(from),
-        to_(to),
-        source_{from_, rgb.data(), valid ? valid->data() : nullptr, solid_of(source_solid, from_),
-                cap},
+        to_(target.map()),
+        target_solid_(*target),
+        source_(source_of(rgb_, valid_, source, cap)),
         turn_(matrix_of(source_from_target)),
-        warp_(source_, to_, solid_of(target_solid, to_), turn_, typical, smooth, 
+        warp_(source_, to_, target_solid_, turn_, typical, smooth,
               variance ? variance->data() : nullptr) {
-    if (!fits(rgb, from) || (valid && !fits(*valid, from)) || (variance && !fits(*variance, from)))
-      throw nb::value_error("arrays and projections differ in size");
+    if (variance && !fits(*variance, source.map())) throw nb::value_error("sigma of another size");
   }
 
   void scatter(const nb::ndarray<const std::int64_t, nb::ndim<1>, nb::c_contig>& hot) {
     nb::gil_scoped_release release;
     for (std::size_t k = 0; k < hot.size(); ++k)
-      if (hot.data()[k] < 0 || hot.data()[k] >= Index(from_.width) * from_.height)
+      if (hot.data()[k] < 0 || hot.data()[k] >= Index(rgb_.shape(0) * rgb_.shape(1)))
         throw std::out_of_range("no such pixel");
     hot_.assign(hot.data(), hot.data() + hot.size());
     warp_.scatter(hot_.data(), hot_.size());
@@ -90,7 +149,7 @@ class Resampling {
     Band band{first, last, nullptr, nullptr, nullptr, nullptr};
     auto radiance = make_array<float, Out<3>>({h, w, 3}, band.radiance);
     auto coverage = make_array<float, Out<2>>({h, w}, band.coverage);
-    auto energy = make_array<double, Result>({h, 3}, band.energy);
+    auto energy = make_array<double, Result>({h, 4}, band.energy);
     std::optional<Out<3>> variance;
     if (variance_) variance = make_array<float, Out<3>>({h, w, 3}, band.variance);
     {
@@ -108,16 +167,15 @@ class Resampling {
     Band band{0, to_.height, nullptr, nullptr, nullptr, nullptr};
     auto radiance = make_array<float, Out<3>>({h, w, 3}, band.radiance, false);
     auto coverage = make_array<float, Out<2>>({h, w}, band.coverage, false);
-    auto sums = make_array<double, Result>({h, 3}, band.energy);
+    auto sums = make_array<double, Result>({h, 4}, band.energy);
     std::array<double, 3> factor{1, 1, 1};
     {
       nb::gil_scoped_release release;
-      const Solid solid = solid_of(target_solid_, to_);
-      Fast(source_, hot_.data(), hot_.size()).gather(to_, solid, turn_, band);
+      Fast(source_, hot_.data(), hot_.size()).gather(to_, target_solid_, turn_, band);
       if (energy) {
         for (std::size_t c = 0; c < 3; ++c) {
           double gathered = 0;
-          for (std::size_t y = 0; y < h; ++y) gathered += band.energy[3 * y + c];
+          for (std::size_t y = 0; y < h; ++y) gathered += band.energy[4 * y + c];
           if (gathered > 0) factor[c] = ((*energy)[c] - warp_.scattered()[c]) / gathered;
         }
         for_rows(0, to_.height, [&](int y) {
@@ -138,9 +196,9 @@ class Resampling {
  private:
   Rgb rgb_;
   std::optional<Mask> valid_;
-  Plane source_solid_, target_solid_;
   std::optional<Rgb> variance_;
-  Projection from_, to_;
+  const Projection& to_;
+  const Solid& target_solid_;
   Source source_;
   Matrix turn_;
   std::vector<Index> hot_;
@@ -148,11 +206,9 @@ class Resampling {
 };
 
 // Sums of each row, (H, 5), and the number of bad pixels: see survey.h.
-auto survey(const Rgb& rgb, const std::optional<Mask>& valid, const Plane& solid, float cap) {
-  const Index h = Index(rgb.shape(0)), w = Index(rgb.shape(1));
-  const Projection shape{.width = int(w), .height = int(h)};
-  const Solid omega = solid_of(solid, shape);
-  if (valid && !fits(*valid, shape)) throw nb::value_error("mask and map differ in size");
+auto survey(const Rgb& rgb, const std::optional<Mask>& valid, const SolidAngles& solid, float cap) {
+  const Source source = source_of(rgb, valid, solid, cap);
+  const Index h = source.projection.height, w = source.projection.width;
   double* out;
   auto sums = make_array<double, Result>({std::size_t(h), 5}, out);
   std::atomic<Index> bad = 0;
@@ -160,10 +216,14 @@ auto survey(const Rgb& rgb, const std::optional<Mask>& valid, const Plane& solid
     nb::gil_scoped_release release;
     for_rows(0, int(h), [&](int y) {
       RowSums row;
-      const bool even = omega.across == 0 && !valid;
-      if (!even || !survey_even_row(rgb.data() + 3 * w * y, omega(0, y), w, cap, row))
-        row = survey_row(rgb.data() + 3 * w * y, valid ? valid->data() + w * y : nullptr,
-                                     omega.values + omega.down * y, omega.across, w, cap);
+      const float* pixels = source.rgb + 3 * w * y;
+      const bool even = source.solid.even && !valid;
+      if (!even || !survey_even_row(pixels, source.solid(0, y), w, cap, row)) {
+        thread_local std::vector<float> omega;
+        omega.resize(std::size_t(w));
+        source.solid.row(y, omega.data());
+        row = survey_row(pixels, valid ? valid->data() + w * y : nullptr, omega.data(), w, cap);
+      }
       std::copy(row.sum, row.sum + 5, out + 5 * Index(y));
       bad += row.bad;
     });
@@ -172,19 +232,15 @@ auto survey(const Rgb& rgb, const std::optional<Mask>& valid, const Plane& solid
 }
 
 // Indices of the usable pixels with a channel above `cap`, in order.
-auto hot_pixels(const Rgb& rgb, const std::optional<Mask>& valid, const Plane& solid, float cap) {
-  const Index h = Index(rgb.shape(0)), w = Index(rgb.shape(1));
-  const Projection shape{.width = int(w), .height = int(h)};
-  const Solid omega = solid_of(solid, shape);
-  if (valid && !fits(*valid, shape)) throw nb::value_error("mask and map differ in size");
+auto hot_pixels(const Rgb& rgb, const std::optional<Mask>& valid, const SolidAngles& solid,
+                float cap) {
+  const Source source = source_of(rgb, valid, solid, cap);
+  const int h = source.projection.height;
   std::vector<std::vector<std::int64_t>> rows(static_cast<std::size_t>(h));
   std::vector<std::int64_t> all;
   {
     nb::gil_scoped_release release;
-    for_rows(0, int(h), [&](int y) {
-      find_hot(rgb.data() + 3 * w * y, valid ? valid->data() + w * y : nullptr,
-               omega.values + omega.down * y, omega.across, w, cap, w * y, rows[std::size_t(y)]);
-    });
+    for_rows(0, h, [&](int y) { find_hot(source, y, rows[std::size_t(y)]); });
     for (const auto& row : rows) all.insert(all.end(), row.begin(), row.end());
   }
   std::int64_t* out;
@@ -277,17 +333,20 @@ NB_MODULE(kernel, m) {
                   })
       .def("project", &project)
       .def("unproject", &unproject);
+  nb::class_<SolidAngles>(m, "SolidAngles")
+      .def(nb::init<const Projection&, Plane, Lines, Columns>())
+      .def("rows", &SolidAngles::rows)
+      .def("total", &SolidAngles::total);
   m.def("survey", &survey, nb::arg("rgb"), nb::arg("valid").none(), nb::arg("solid"),
         nb::arg("cap"));
   m.def("hot_pixels", &hot_pixels, nb::arg("rgb"), nb::arg("valid").none(), nb::arg("solid"),
         nb::arg("cap"));
   nb::class_<Resampling>(m, "Resampling")
-      .def(nb::init<Rgb, std::optional<Mask>, Plane, Plane, std::optional<Rgb>, const Projection&,
-                    const Projection&, const Turn&, float, float, bool>(),
-           nb::arg("rgb"), nb::arg("valid").none(), nb::arg("source_solid"),
-           nb::arg("target_solid"), nb::arg("variance").none(), nb::arg("source"),
+      .def(nb::init<Rgb, std::optional<Mask>, std::optional<Rgb>, const SolidAngles&,
+                    const SolidAngles&, const Turn&, float, float, bool>(),
+           nb::arg("rgb"), nb::arg("valid").none(), nb::arg("variance").none(), nb::arg("source"),
            nb::arg("target"), nb::arg("source_from_target"), nb::arg("cap"), nb::arg("typical"),
-           nb::arg("smooth"))
+           nb::arg("smooth"), nb::keep_alive<1, 5>(), nb::keep_alive<1, 6>())
       .def("scatter", &Resampling::scatter)
       .def("rows", &Resampling::rows)
       .def("fast", &Resampling::fast, nb::arg("energy").none())

@@ -47,16 +47,26 @@ class Projection:
     def project(self, directions: NDArray[np.float64], /) -> NDArray[np.float64]: ...
     def unproject(self, pixels: NDArray[np.float64], /) -> NDArray[np.float64]: ...
 
+class SolidAngles:
+    def __init__(
+        self,
+        map: Projection,
+        values: NDArray[np.float32],
+        lines: NDArray[np.int64],
+        columns: NDArray[np.int32],
+        /,
+    ) -> None: ...
+    def rows(self, first: int, last: int, /) -> NDArray[np.float32]: ...
+    def total(self) -> float: ...
+
 class Resampling:
     def __init__(
         self,
         rgb: NDArray[np.float32],
         valid: NDArray[np.bool_] | None,
-        source_solid: NDArray[np.float32],
-        target_solid: NDArray[np.float32],
         variance: NDArray[np.float32] | None,
-        source: Projection,
-        target: Projection,
+        source: SolidAngles,
+        target: SolidAngles,
         source_from_target: NDArray[np.float64],
         cap: float,
         typical: float,
@@ -80,12 +90,12 @@ class Resampling:
 def survey(
     rgb: NDArray[np.float32],
     valid: NDArray[np.bool_] | None,
-    solid: NDArray[np.float32],
+    solid: SolidAngles,
     cap: float,
 ) -> tuple[NDArray[np.float64], int]: ...
 def hot_pixels(
     rgb: NDArray[np.float32],
     valid: NDArray[np.bool_] | None,
-    solid: NDArray[np.float32],
+    solid: SolidAngles,
     cap: float,
 ) -> NDArray[np.int64]: ...

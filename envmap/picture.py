@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from chromeball.scene.color import luminance
 from chromeball.scene.errors import UserError
-from chromeball.scene.image import read_image, to_display, write_picture
+from chromeball.scene.image import linear_rows, to_display, write_picture
 
 #: What a map says about itself and is handed on, by OpenImageIO's names: `DateTime` is
 #: OpenEXR's capDate, `Copyright` its owner.
@@ -57,38 +57,46 @@ def read_radiance(path: str | os.PathLike[str]) -> Radiance:
         When the file is no linear picture, or a valid pixel is NaN, infinite or negative.
 
     """
-    image = read_image(path)
-    if not image.linear:
+    with linear_rows(path) as (header, parts):
+        names = list(header.channels)
+        width, height = header.size
+        if all(name in names for name in "RGB"):
+            colours = [names.index(name) for name in "RGB"]
+        elif len(names) in (1, 2):
+            colours = [0, 0, 0]
+        else:
+            raise UserError(f"no channels R, G, B: it holds {', '.join(names)}", file=path)
+        noise = [names.index(f"sigma.{name}") for name in "RGB" if f"sigma.{name}" in names]
+        rgb = np.empty((height, width, 3), np.float32)
+        valid = np.empty((height, width), bool) if "A" in names else None
+        clipped = np.empty((height, width), bool) if "clipped" in names else None
+        sigma = np.empty((height, width, 3), np.float32) if len(noise) == 3 else None
+        count, where = 0, (0, 0)
+        for first, pixels in parts:
+            rows = slice(first, first + len(pixels))
+            part = pixels[..., colours]
+            bad = ~(np.isfinite(part) & (part >= 0)).all(axis=2)
+            if valid is not None:
+                valid[rows] = pixels[..., names.index("A")] > 0
+                part[bad & ~valid[rows]] = 0
+                bad &= valid[rows]
+            if bad.any() and not count:
+                y, x = np.argwhere(bad)[0]
+                where = (int(x), first + int(y))
+            count += int(bad.sum())
+            rgb[rows] = part
+            if clipped is not None:
+                clipped[rows] = pixels[..., names.index("clipped")] > 0
+            if sigma is not None:
+                sigma[rows] = pixels[..., noise]
+    if count:
         raise UserError(
-            "not a scene-linear picture; merge it with `hdr merge` first", file=path
-        )
-    names = list(image.channels)
-    pixels = image.radiance()
-    if all(name in names for name in "RGB"):
-        rgb = pixels[..., [names.index(name) for name in "RGB"]]
-    elif len(names) in (1, 2):
-        rgb = np.repeat(pixels[..., :1], 3, axis=2)
-    else:
-        raise UserError(f"no channels R, G, B: it holds {', '.join(names)}", file=path)
-    valid = pixels[..., names.index("A")] > 0 if "A" in names else None
-    bad = ~(np.isfinite(rgb) & (rgb >= 0)).all(axis=2)
-    if valid is not None:
-        rgb = np.where((bad & ~valid)[..., None], np.float32(0), rgb)
-        bad &= valid
-    if bad.any():
-        y, x = np.argwhere(bad)[0]
-        raise UserError(
-            f"{int(bad.sum())} pixels are NaN, infinite or negative, the first at x {x}, y {y}",
+            f"{count} pixels are NaN, infinite or negative, the first at x {where[0]}, "
+            f"y {where[1]}",
             file=path,
         )
-    kept = {name: image.attributes[name] for name in KEPT if name in image.attributes}
-    clipped = pixels[..., names.index("clipped")] > 0 if "clipped" in names else None
-    sigma = None
-    if all(f"sigma.{name}" in names for name in "RGB"):
-        sigma = np.ascontiguousarray(
-            pixels[..., [names.index(f"sigma.{name}") for name in "RGB"]]
-        )
-    return Radiance(np.ascontiguousarray(rgb), valid, clipped, kept, sigma)
+    kept = {name: header.attributes[name] for name in KEPT if name in header.attributes}
+    return Radiance(rgb, valid, clipped, kept, sigma)
 
 
 def read_latlong(path: str | os.PathLike[str]) -> Radiance:
@@ -167,6 +175,39 @@ def tone_mapped(
         seen = np.asarray(cv2.resize(alpha, size, interpolation=cv2.INTER_AREA))
         small = small * (0.35 + 0.65 * np.clip(seen, 0, 1))[..., None]
     return to_display(small)
+
+
+class Preview:
+    """A small picture of a large one, `size` is width and height, that comes by rows.
+
+    Whole blocks of pixels are averaged, down to a width of 1024 to 2048.
+    """
+
+    def __init__(self, size: tuple[int, int]) -> None:
+        self._step = max(1, size[0] // 1024)
+        self._rgba: list[NDArray[np.float32]] = []
+        self._rest = np.zeros((0, size[0], 4), np.float32)
+
+    def add(self, rgb: NDArray[np.float32], alpha: NDArray[np.float32]) -> None:
+        """Append rows (h, W, 3) and (h, W)."""
+        step = self._step
+        rows = np.concatenate([self._rest, np.dstack([rgb, alpha])])
+        count = len(rows) // step
+        if count:
+            self._rgba.append(self._blocks(rows[: count * step]))
+        self._rest = rows[count * step :]
+
+    def picture(self) -> NDArray[np.uint8]:
+        """All rows so far, :func:`tone_mapped`."""
+        rest = [self._blocks(self._rest)] if len(self._rest) else []
+        rgba = np.concatenate([*self._rgba, *rest])
+        return tone_mapped(np.ascontiguousarray(rgba[..., :3]), rgba[..., 3])
+
+    def _blocks(self, rows: NDArray[np.float32]) -> NDArray[np.float32]:
+        at = [np.arange(0, n, self._step) for n in rows.shape[:2]]
+        down = np.add.reduceat(np.add.reduceat(rows, at[0], axis=0), at[1], axis=1)
+        counts = [np.diff([*k, n]) for k, n in zip(at, rows.shape[:2], strict=True)]
+        return (down / np.multiply.outer(*counts)[..., None]).astype(np.float32)
 
 
 def write_preview(output: Path, kind: str, display: NDArray[np.uint8]) -> str:

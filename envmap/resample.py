@@ -8,8 +8,8 @@ coarse, the pixels' own areas. What rises far above the mean is scattered as ene
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -87,36 +87,174 @@ def warp(
         When an array does not fit its mapping, or radiance is negative or not finite.
 
     """
-    shape = (source.size[1], source.size[0], 3)
-    for array in (radiance, sigma):
-        if array is not None and array.shape != shape:
-            raise ValueError(f"{array.shape} does not fit a map of {source.size}")
-    radiance = np.ascontiguousarray(radiance, np.float32)
-    mask = None if valid is None else np.ascontiguousarray(valid)
-    found = survey(lambda cap: kernel.survey(radiance, mask, source.omega, cap), source)
-    hot = kernel.hot_pixels(radiance, mask, source.omega, found.cap)
-    variance = None
-    if sigma is not None:
-        variance = np.square(np.where(np.isfinite(sigma), sigma, 0), dtype=np.float32)
-    job = resampling(radiance, source, target, found, rotation, mask, smooth, variance)
-    job.scatter(hot)
-    balance: tuple[float, ...] = (1.0, 1.0, 1.0)
-    if quality == "fast" and is_smooth(source, target, smooth) and variance is None:
-        whole = mask is None and source.whole and target.whole
-        out, coverage, energy, factors = job.fast(found.energy.tolist() if whole else None)
-        balance = tuple(factors)
-    else:
-        out, coverage, variance, energy = job.rows(0, target.size[1])
-    return Warped(
-        radiance=out,
-        coverage=coverage,
-        source_energy=found.energy,
-        energy=energy.sum(axis=0),
-        outside=np.array(job.outside()),
-        hot_pixels=len(hot),
-        sigma=None if variance is None else np.sqrt(variance),
-        balance=balance,
+    job = Warping(
+        radiance,
+        source,
+        target,
+        rotation=rotation,
+        valid=valid,
+        smooth=smooth,
+        sigma=sigma,
+        quality=quality,
     )
+    band = job.rows(0, target.size[1])
+    return Warped(
+        radiance=band.radiance,
+        coverage=band.coverage,
+        source_energy=job.source_energy,
+        energy=job.energy,
+        outside=job.outside,
+        hot_pixels=job.hot_pixels,
+        sigma=band.sigma,
+        balance=job.balance,
+    )
+
+
+@dataclass(frozen=True)
+class Band:
+    """Rows ``first`` .. ``last`` - 1 of a result, arrays as those of :class:`Warped`."""
+
+    first: int
+    last: int
+    radiance: NDArray[np.float32]
+    coverage: NDArray[np.float32]
+    sigma: NDArray[np.float32] | None
+
+
+class Warping:
+    """A resampling set up, for results that are made by rows; arguments as :func:`warp`.
+
+    It holds the source, the spline around the rows made last, 36 bytes a source pixel there,
+    and 32 bytes for each pair of a hot pixel and a pixel it falls on. The rows are the same, bit
+    for bit, however they are asked for; the fast way makes its result at once and holds it.
+    Energies are those of the rows made so far, each once.
+    """
+
+    def __init__(
+        self,
+        radiance: NDArray[np.float32],
+        source: Mapping,
+        target: Mapping,
+        *,
+        rotation: NDArray[np.float64] | None = None,
+        valid: NDArray[np.bool_] | None = None,
+        smooth: bool | None = None,
+        sigma: NDArray[np.float32] | None = None,
+        quality: Quality = "best",
+    ) -> None:
+        shape = (source.size[1], source.size[0], 3)
+        for array in (radiance, sigma):
+            if array is not None and array.shape != shape:
+                raise ValueError(f"{array.shape} does not fit a map of {source.size}")
+        radiance = np.ascontiguousarray(radiance, np.float32)
+        mask = None if valid is None else np.ascontiguousarray(valid)
+        found = survey(lambda cap: kernel.survey(radiance, mask, source.solid, cap), source)
+        hot = kernel.hot_pixels(radiance, mask, source.solid, found.cap)
+        variance = None
+        if sigma is not None:
+            variance = np.square(np.where(np.isfinite(sigma), sigma, 0), dtype=np.float32)
+        turn = np.eye(3) if rotation is None else rotation
+        smooth = is_smooth(source, target, smooth)
+        self._kernel = kernel.Resampling(
+            radiance,
+            mask,
+            variance,
+            source.solid,
+            target.solid,
+            np.ascontiguousarray(source.rotation.T @ turn.T @ target.rotation),
+            found.cap,
+            found.typical,
+            smooth,
+        )
+        self._kernel.scatter(hot)
+        self._sums: list[NDArray[np.float64]] = []
+        self._height = target.size[1]
+        self._fast: Band | None = None
+        self.source_energy = found.energy
+        self.hot_pixels = len(hot)
+        self.balance: tuple[float, ...] = (1.0, 1.0, 1.0)
+        if quality == "fast" and smooth and variance is None:
+            whole = mask is None and source.whole and target.whole
+            out, coverage, sums, factors = self._kernel.fast(
+                found.energy.tolist() if whole else None
+            )
+            self.balance = tuple(factors)
+            self._fast = Band(0, self._height, out, coverage, None)
+            self._sums.append(sums)
+
+    def rows(self, first: int, last: int) -> Band:
+        """Rows `first` .. `last` - 1."""
+        if self._fast is not None:
+            return replace(
+                self._fast,
+                first=first,
+                last=last,
+                radiance=self._fast.radiance[first:last],
+                coverage=self._fast.coverage[first:last],
+            )
+        out, coverage, variance, sums = self._kernel.rows(first, last)
+        self._sums.append(sums)
+        sigma = None if variance is None else np.sqrt(variance)
+        return Band(first, last, out, coverage, sigma)
+
+    def bands(self, height: int = 64) -> Iterator[Band]:
+        """All rows from the top, `height` at a time; what is no longer needed is freed."""
+        for first in range(0, self._height, height):
+            yield self.rows(first, min(first + height, self._height))
+            self._kernel.forget()
+
+    @property
+    def energy(self) -> NDArray[np.float64]:
+        """Sums of L dOmega per channel of the rows made so far."""
+        return self._totals()[:3]
+
+    @property
+    def seen(self) -> float:
+        """Solid angle that the source covers of the rows made so far, sr."""
+        return float(self._totals()[3])
+
+    @property
+    def outside(self) -> NDArray[np.float64]:
+        """Energy of hot pixels that the target does not see, once all rows are made."""
+        return np.array(self._kernel.outside())
+
+    def _totals(self) -> NDArray[np.float64]:
+        # all at once: the sum does not depend on the bands
+        return np.concatenate(self._sums or [np.zeros((1, 4))]).sum(axis=0)
+
+
+class Marks:
+    """The share of each target pixel that marked source pixels cover, made by rows."""
+
+    def __init__(self, job: Warping) -> None:
+        self._job = job
+
+    def rows(self, first: int, last: int) -> NDArray[np.float32]:
+        """Rows `first` .. `last` - 1, (last - first, W), 0 .. 1."""
+        share = self._job.rows(first, last).radiance[..., 0]
+        # pieces that fall to one side or the other of a pixel's edge add up to a little over 1
+        return np.minimum(share, np.float32(1))
+
+    @property
+    def solid_angle(self) -> float:
+        """What is marked in the rows made so far, sr."""
+        return float(self._job.energy[0])
+
+
+def marking(
+    mask: NDArray[np.bool_],
+    source: Mapping,
+    target: Mapping,
+    *,
+    rotation: NDArray[np.float64] | None = None,
+    valid: NDArray[np.bool_] | None = None,
+) -> Marks:
+    """Marked source pixels (H, W) carried along: none is lost between samples.
+
+    Where few are set they are scattered. It holds 12 bytes a source pixel.
+    """
+    marks = np.repeat(mask.astype(np.float32)[..., None], 3, axis=2)
+    return Marks(Warping(marks, source, target, rotation=rotation, valid=valid, smooth=False))
 
 
 def carry(
@@ -127,14 +265,9 @@ def carry(
     rotation: NDArray[np.float64] | None = None,
     valid: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.float32]:
-    """The share of each target pixel, (H, W), that marked source pixels (H, W) cover.
-
-    A mark is not lost between samples: where few are set they are scattered.
-    """
-    marks = np.repeat(mask.astype(np.float32)[..., None], 3, axis=2)
-    share = warp(marks, source, target, rotation=rotation, valid=valid, smooth=False)
-    # pieces that fall to one side or the other of a pixel's edge add up to a little over 1
-    return np.minimum(share.radiance[..., 0], np.float32(1))
+    """The share of each target pixel, (H, W), that marked source pixels (H, W) cover."""
+    found = marking(mask, source, target, rotation=rotation, valid=valid)
+    return found.rows(0, target.size[1])
 
 
 def survey(
@@ -160,33 +293,6 @@ def survey(
         if cap > 0.8 * before:
             break
     return Survey(energy=np.array(energy), cap=cap, typical=1 / source.density**2)
-
-
-def resampling(
-    radiance: NDArray[np.float32],
-    source: Mapping,
-    target: Mapping,
-    found: Survey,
-    rotation: NDArray[np.float64] | None,
-    valid: NDArray[np.bool_] | None,
-    smooth: bool | None,
-    variance: NDArray[np.float32] | None,
-) -> kernel.Resampling:
-    """The kernel set up; rows of the result can be asked for in any order."""
-    turn = np.eye(3) if rotation is None else rotation
-    return kernel.Resampling(
-        radiance,
-        valid,
-        source.omega,
-        target.omega,
-        variance,
-        source.kernel,
-        target.kernel,
-        np.ascontiguousarray(source.rotation.T @ turn.T @ target.rotation),
-        found.cap,
-        found.typical,
-        is_smooth(source, target, smooth),
-    )
 
 
 def is_smooth(source: Mapping, target: Mapping, wish: bool | None = None) -> bool:

@@ -20,18 +20,39 @@ inline float base_share(const float* rgb, float cap) {
   return top > cap ? cap / top : 1.f;
 }
 
-// Solid angles of pixels; those of a lat-long stand once a row.
+// Solid angles of pixels. Rows and columns that are alike share their values: all columns of a
+// lat-long, the quarters of a disc, the faces of a cube.
 struct Solid {
+  const Projection& map;
   const float* values;
-  Index across, down;
-  float operator()(Index x, Index y) const { return values[y * down + x * across]; }
+  const std::int64_t* line;    // where a row's values begin
+  const std::int32_t* column;  // a column's place among them
+  bool even;                   // one value a row
+  bool holes;                  // some are 0
+
+  // Of a cube's pixel it must lie in a face.
+  float operator()(Index x, Index y) const { return values[line[y] + column[x]]; }
+
+  // A whole row, 0 beside a cube's faces.
+  void row(Index y, float* out) const {
+    const float* own = values + line[y];
+    for (Index x = 0; x < map.width; ++x) out[x] = own[column[x]];
+    if (!map.cubic()) return;
+    for (int left = 0; left < map.width; left += map.face) {
+      const auto here = [&](const Face& f) {
+        return Index(f.row) == y / map.face && int(f.column) * map.face == left;
+      };
+      if (std::none_of(map.faces.begin(), map.faces.end(), here))
+        std::fill_n(out + left, map.face, 0.f);
+    }
+  }
 };
 
 struct Source {
   const Projection& projection;
   const float* rgb;
   const bool* valid;  // null: all
-  Solid solid;
+  const Solid& solid;
   float cap;
 
   Index index(Cell c) const { return Index(c.y) * projection.width + c.x; }
@@ -106,13 +127,18 @@ class Histospline {
         across_((width_ + kBlock - 1) / kBlock),
         per_sheet_(across_ * ((height_ + kBlock - 1) / kBlock)),
         blocks_(std::size_t(per_sheet_) * std::size_t(source.projection.sheets())) {}
-  ~Histospline() { forget(); }
+  ~Histospline() {
+    for (auto& slot : blocks_) delete slot.load();
+  }
   Histospline(const Histospline&) = delete;
   Histospline& operator=(const Histospline&) = delete;
 
-  // Free all blocks; nobody may be looking.
+  // Free the blocks that were not looked at since the last time; nobody may be looking.
   void forget() {
-    for (auto& block : blocks_) delete block.exchange(nullptr);
+    for (auto& slot : blocks_)
+      if (const Block* block = slot.load(); block && block->used.load() != turn_)
+        delete slot.exchange(nullptr);
+    ++turn_;
   }
 
   // The surface at a place, and 1; all 0 where the pixel there is not valid.
@@ -190,12 +216,18 @@ class Histospline {
   struct Block {
     std::array<Float4, kBlock * kBlock> average;     // w: 1 where valid
     std::array<Float4, kSide * kSide> coefficient;   // w: the limiter's t of the cell
+    mutable std::atomic<std::uint32_t> used = 0;     // the turn in which it was looked at
   };
 
   const Block& at(int sheet, int bx, int by) const {
     auto& slot = blocks_[std::size_t(sheet * per_sheet_ + by * across_ + bx)];
-    if (const Block* block = slot.load(std::memory_order_acquire)) return *block;
+    if (const Block* block = slot.load(std::memory_order_acquire)) {
+      if (block->used.load(std::memory_order_relaxed) != turn_)
+        block->used.store(turn_, std::memory_order_relaxed);
+      return *block;
+    }
     auto made = build(sheet, bx * kBlock, by * kBlock);
+    made->used = turn_;
     Block* nothing = nullptr;
     // another thread may have been quicker: its block is the same
     if (slot.compare_exchange_strong(nothing, made.get(), std::memory_order_acq_rel))
@@ -340,6 +372,7 @@ class Histospline {
 
   const Source& source_;
   int width_, height_, across_, per_sheet_;
+  std::uint32_t turn_ = 0;
   mutable std::vector<std::atomic<Block*>> blocks_;
 };
 

@@ -17,14 +17,14 @@ struct RowSums {
   Index bad;
 };
 
-inline RowSums survey_row(const float* rgb, const bool* valid, const float* solid, Index across,
-                          Index width, float cap) {
+inline RowSums survey_row(const float* rgb, const bool* valid, const float* solid, Index width,
+                          float cap) {
   constexpr float kLargest = std::numeric_limits<float>::max();
   double covered = 0, top = 0, red = 0, green = 0, blue = 0;
   std::int32_t bad = 0;
 #pragma omp simd reduction(+ : covered, top, red, green, blue, bad)
   for (Index x = 0; x < width; ++x) {
-    const float r = rgb[3 * x], g = rgb[3 * x + 1], b = rgb[3 * x + 2], omega = solid[x * across];
+    const float r = rgb[3 * x], g = rgb[3 * x + 1], b = rgb[3 * x + 2], omega = solid[x];
     const bool used = (omega > 0) & (valid ? valid[x] : true);
     // comparisons with NaN are false
     const bool good = (r >= 0) & (r <= kLargest) & (g >= 0) & (g <= kLargest) & (b >= 0) &
@@ -66,18 +66,23 @@ inline bool survey_even_row(const float* rgb, float solid, Index width, float ca
   return true;
 }
 
-inline void find_hot(const float* rgb, const bool* valid, const float* solid, Index across,
-                     Index width, float cap, Index first, std::vector<std::int64_t>& hot) {
+inline void find_hot(const Source& source, Index y, std::vector<std::int64_t>& hot) {
   constexpr Index chunk = 64;
+  const Index width = source.projection.width;
+  const float* rgb = source.rgb + 3 * width * y;
+  const float cap = source.cap;
+  std::vector<float> solid;
   for (Index begin = 0; begin < width; begin += chunk) {
     const Index end = std::min(width, begin + chunk);
     std::int32_t any = 0;
 #pragma omp simd reduction(| : any)
     for (Index k = 3 * begin; k < 3 * end; ++k) any |= rgb[k] > cap ? 1 : 0;
     if (!any) continue;
+    if (solid.empty()) solid.resize(std::size_t(width)), source.solid.row(y, solid.data());
     for (Index x = begin; x < end; ++x)
-      if (solid[x * across] > 0 && (!valid || valid[x]) && largest(rgb + 3 * x) > cap)
-        hot.push_back(first + x);
+      if (solid[std::size_t(x)] > 0 && (!source.valid || source.valid[width * y + x]) &&
+          largest(rgb + 3 * x) > cap)
+        hot.push_back(width * y + x);
   }
 }
 

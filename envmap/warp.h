@@ -29,7 +29,7 @@ struct Band {
   float* radiance;
   float* coverage;
   float* variance;  // null: not asked for
-  double* energy;   // 3 a row: sums of L times the seen solid angle
+  double* energy;   // 4 a row: sums of L times the seen solid angle, and of that
 };
 
 // Energy that falls on a pixel, in quanta: integers do not depend on the order of addition.
@@ -45,7 +45,7 @@ struct Tally {
 
 class Warp {
  public:
-  Warp(const Source& source, const Projection& to, Solid target_solid, const Matrix& rotation,
+  Warp(const Source& source, const Projection& to, const Solid& target_solid, const Matrix& rotation,
        float typical, bool smooth, const float* variance)
       : source_(source),
         from_(source.projection),
@@ -89,7 +89,13 @@ class Warp {
         scatter_cell(hot[n], pieces, parts[part]);
     });
     deposits_.clear();
-    for (const auto& part : parts) deposits_.insert(deposits_.end(), part.begin(), part.end());
+    std::size_t all = 0;
+    for (const auto& part : parts) all += part.size();
+    deposits_.reserve(all);
+    for (auto& part : parts) {
+      deposits_.insert(deposits_.end(), part.begin(), part.end());
+      std::vector<Deposit>().swap(part);
+    }
     tbb::parallel_sort(deposits_.begin(), deposits_.end(),
                        [](const Deposit& a, const Deposit& b) { return a.pixel < b.pixel; });
   }
@@ -124,16 +130,18 @@ class Warp {
     for_rows(band.first, band.last, [&](int y) {
       const Index row = Index(y - band.first) * to_.width;
       const float *rgb = band.radiance + 3 * row, *seen = band.coverage + row;
-      double red = 0, green = 0, blue = 0;
-#pragma omp simd reduction(+ : red, green, blue)
+      const float* omega = solids_of(y);
+      double red = 0, green = 0, blue = 0, covered = 0;
+#pragma omp simd reduction(+ : red, green, blue, covered)
       for (Index x = 0; x < to_.width; ++x) {
-        const double w = double(target_solid_(x, y)) * double(seen[x]);
+        const double w = double(omega[x]) * double(seen[x]);
+        covered += w;
         red += w * double(rgb[3 * x]);
         green += w * double(rgb[3 * x + 1]);
         blue += w * double(rgb[3 * x + 2]);
       }
-      double* sum = band.energy + 3 * (y - band.first);
-      sum[0] = red, sum[1] = green, sum[2] = blue;
+      double* sum = band.energy + 4 * (y - band.first);
+      sum[0] = red, sum[1] = green, sum[2] = blue, sum[3] = covered;
     });
   }
 
@@ -148,6 +156,14 @@ class Warp {
   }
 
  private:
+  // The solid angles of a row of the target.
+  const float* solids_of(int y) const {
+    thread_local std::vector<float> row;
+    row.resize(std::size_t(to_.width));
+    target_solid_.row(y, row.data());
+    return row.data();
+  }
+
   struct Sampling {
     int across, down;
   };
@@ -195,6 +211,7 @@ class Warp {
     constexpr int group = kBatch / 5;
     constexpr float h = 0.499f;
     const float density = spline_ ? 1.5f : 1.6f, least_ = 2.f;
+    const float* solids = solids_of(y);
     for (int first = 0; first < to_.width; first += group) {
       const int n = std::min(group, to_.width - first);
       for (int k = 0; k < n; ++k) {
@@ -208,14 +225,14 @@ class Warp {
       for (int k = 0; k < n; ++k) {
         const bool there = r.jacobian[n + k] > 0 && r.jacobian[2 * n + k] > 0 &&
                            r.jacobian[3 * n + k] > 0 && r.jacobian[4 * n + k] > 0;
-        const float rough = 2 * std::sqrt(target_solid_(first + k, y));
+        const float rough = 2 * std::sqrt(solids[first + k]);
         across[k] = there ? length(r.at(n + k) - r.at(2 * n + k)) : rough;
         down[k] = there ? length(r.at(3 * n + k) - r.at(4 * n + k)) : rough;
       }
       r.turn(source_from_target_, n);
       from_.project(r, n, desk.places);
       for (int k = 0; k < n; ++k) {
-        const float solid = target_solid_(first + k, y);
+        const float solid = solids[first + k];
         float cell = typical_;
         if (r.jacobian[k] > 0 && desk.places.sheet[k] >= 0) {
           const Cell c = from_.nearest(desk.places.sheet[k], desk.places.x[k], desk.places.y[k]);
@@ -436,7 +453,7 @@ class Warp {
   const Source& source_;
   const Projection& from_;
   const Projection& to_;
-  Solid target_solid_;
+  const Solid& target_solid_;
   Matrix source_from_target_, target_from_source_;
   float typical_;
   const float* variance_;  // of the source, (H, W, 3)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 import os
 import zlib
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -134,6 +134,64 @@ def read_image(path: str | os.PathLike[str], *, straight_alpha: bool = False) ->
         exposure=exposure_of(attributes),
         attributes=attributes,
     )
+
+
+@contextmanager
+def linear_rows(
+    path: str | os.PathLike[str], height: int = 64
+) -> Generator[tuple[Header, Iterator[tuple[int, NDArray[np.float32]]]]]:
+    """Read a scene-linear picture by rows: its header, and pairs of first row and pixels.
+
+    Pixels (h, W, C) are float32, negative ones as :meth:`Image.radiance` has them; h is about
+    `height`, whole tiles of a tiled file. A camera RAW is developed whole.
+
+    Raises
+    ------
+    UserError
+        When the file is missing, truncated, or no linear picture.
+
+    """
+    header = read_header(path)
+    if Path(path).suffix.lower() not in LINEAR_SUFFIXES - RAW_SUFFIXES:
+        image = read_image(path)
+        if not image.linear:
+            raise UserError(
+                "not a scene-linear picture; merge it with `hdr merge` first", file=path
+            )
+        yield replace(header, channels=image.channels), iter([(0, image.radiance())])
+        return
+    import OpenImageIO as oiio
+
+    source = oiio.ImageInput.open(os.fspath(path))
+    if source is None:
+        raise UserError(f"not a readable picture: {_reason(oiio.geterror)}", file=path)
+    meant = NEGATIVE_MEANING in header.attributes
+
+    def rows() -> Iterator[tuple[int, NDArray[np.float32]]]:
+        spec = source.spec()
+        left, top = spec.x, spec.y
+        tile = spec.tile_height
+        step = max(1, height // tile) * tile if tile else height
+        for first in range(0, spec.height, step):
+            last = min(first + step, spec.height)
+            if tile:
+                area = (left, left + spec.width, top + first, top + last, 0, 1)
+                part = source.read_tiles(*area, 0, spec.nchannels, "float")
+            else:
+                part = source.read_scanlines(
+                    top + first, top + last, 0, 0, spec.nchannels, "float"
+                )
+            if part is None or source.has_error:
+                raise UserError(
+                    f"truncated or damaged picture: {_reason(source.geterror)}", file=path
+                )
+            pixels = np.asarray(part, np.float32).reshape(last - first, spec.width, -1)
+            yield first, np.maximum(pixels, 0) if meant else pixels
+
+    try:
+        yield header, rows()
+    finally:
+        source.close()
 
 
 @dataclass(frozen=True)

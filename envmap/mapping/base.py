@@ -6,14 +6,45 @@ import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from chromeball.envmap.kernel import Projection
+from chromeball.envmap.kernel import Projection, SolidAngles
 from chromeball.scene.camera import WORLD_FROM_LATLONG
 
 type Array = NDArray[np.float64]
+
+
+class Pattern(NamedTuple):
+    """Pixel (x, y) has ``values[lines[y], columns[x]]``; a cube's, where there is a face."""
+
+    values: Array
+    lines: NDArray[np.int64]
+    columns: NDArray[np.int32]
+
+    def spread(self) -> Array:
+        """(H, W)."""
+        return self.values[self.lines[:, None], self.columns[None, :]]
+
+
+def each_its_own(values: Array) -> Pattern:
+    """The pattern of a map (H, W) without symmetry."""
+    height, width = values.shape
+    return Pattern(values, np.arange(height), np.arange(width, dtype=np.int32))
+
+
+def mirrored(quarter: Array, size: tuple[int, int]) -> Pattern:
+    """The pattern of a map that is alike on both sides of its middle lines.
+
+    `quarter` begins at the middle and goes right and down; of an odd size it has the middle
+    line.
+    """
+    width, height = size
+    lines = np.abs(2 * np.arange(height) - (height - 1)) // 2
+    columns = np.abs(2 * np.arange(width) - (width - 1)) // 2
+    return Pattern(quarter, lines, columns.astype(np.int32))
 
 
 @dataclass(frozen=True)
@@ -36,8 +67,12 @@ class Mapping(ABC):
         """Pixels to unit directions in camera axes, ``(..., 2) -> (..., 3)``; NaN outside."""
 
     @abstractmethod
+    def pattern(self) -> Pattern:
+        """Exact solid angles of the valid parts of the pixels, those that are alike once."""
+
     def solid_angles(self) -> Array:
         """Exact solid angle of the valid part of each pixel, (H, W) steradians."""
+        return self.pattern().spread()
 
     @cached_property
     @abstractmethod
@@ -45,21 +80,31 @@ class Mapping(ABC):
         """The same mapping for the C++ kernel."""
 
     @cached_property
+    def _pattern(self) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.int32]]:
+        values, lines, columns = self.pattern()
+        return np.ascontiguousarray(values, np.float32), lines, columns
+
+    @cached_property
+    def solid(self) -> SolidAngles:
+        """:meth:`solid_angles` for the kernel."""
+        return SolidAngles(self.kernel, *self._pattern)
+
+    @cached_property
     def omega(self) -> NDArray[np.float32]:
-        """:meth:`solid_angles` for the kernel: (H, W), or (H, 1) of even rows."""
-        return self.solid_angles().astype(np.float32)
+        """:meth:`solid_angles` as float32, (H, W), or (H, 1) of even rows."""
+        return self.solid.rows(0, self.size[1])
 
     @cached_property
     def density(self) -> float:
         """Pixels a radian, typically."""
-        omega = self.omega.reshape(-1)
+        omega = self._pattern[0].reshape(-1)
         step = max(1, len(omega) // 20_000) | 1
         return float(1 / np.sqrt(np.median(omega[omega > 0][::step])))
 
     @cached_property
     def whole(self) -> bool:
         """Whether it sees the whole sphere."""
-        return abs(float(self.omega.sum(dtype=float)) - 4 * math.pi) < 1e-4
+        return abs(self.solid.total() - 4 * math.pi) < 1e-4
 
     def pixels_of(self, world: ArrayLike) -> Array:
         """Directions in world axes to pixels, ``(..., 3) -> (..., 2)``; NaN where unseen."""

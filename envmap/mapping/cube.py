@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from chromeball.envmap.kernel import Projection
-from chromeball.envmap.mapping.base import Array, Mapping
+from chromeball.envmap.mapping.base import Array, Mapping, Pattern, mirrored
 from chromeball.scene.camera import CUBE_FACES
 
 type Triple = tuple[int, int, int]
@@ -102,18 +102,34 @@ class Cube(Mapping):
         return d
 
     @override
-    def solid_angles(self) -> Array:
+    def pattern(self) -> Pattern:
         n = self.face
-        edge = np.linspace(-1, 1, n + 1)
-        a, b = np.meshgrid(edge, edge)
+        edge = (2 * np.arange((n + 1) // 2 + 1) - n % 2) / n
+        a, b = edge[None, :], edge[:, None]
         corner = np.arctan2(a * b, np.sqrt(a * a + b * b + 1))
-        one = np.diff(np.diff(corner, axis=0), axis=1)
-        one = one * (4 * math.pi / 6 / one.sum())  # rounding of the differences
-        solid = np.zeros((self.size[1], self.size[0]))
+        one = mirrored(np.diff(np.diff(corner, axis=0), axis=1), (n, n))
+        total = np.bincount(one.lines) @ one.values @ np.bincount(one.columns)
+        return Pattern(
+            one.values * (4 * math.pi / 6 / total),  # rounding of the differences
+            np.tile(one.lines, self.size[1] // n),
+            np.tile(one.columns, self.size[0] // n),
+        )
+
+    @override
+    def solid_angles(self) -> Array:
+        n, everywhere = self.face, super().solid_angles()
+        solid = np.zeros_like(everywhere)
         for face in self.layout:
-            top, left = face.row * n, face.column * n
-            solid[top : top + n, left : left + n] = one
+            place = np.s_[
+                face.row * n : face.row * n + n, face.column * n : face.column * n + n
+            ]
+            solid[place] = everywhere[place]
         return solid
+
+    @cached_property
+    @override
+    def whole(self) -> bool:
+        return True
 
     @cached_property
     @override

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from chromeball.envmap.kernel import Projection
-from chromeball.envmap.mapping.base import Array, Mapping
+from chromeball.envmap.mapping.base import Array, Mapping, Pattern
 from chromeball.scene.camera import CameraModel
 
 
@@ -30,20 +30,18 @@ class LatLong(Mapping):
         return self._camera.unproject(pixels)
 
     @override
-    def solid_angles(self) -> Array:
-        return np.repeat(self._rows()[:, None], self.size[0], axis=1)
-
-    def _rows(self) -> Array:
+    def pattern(self) -> Pattern:
         width, height = self.size
         edges = np.linspace(-math.pi / 2, math.pi / 2, height + 1)
         # sin b - sin a without cancellation
         middle, half = (edges[1:] + edges[:-1]) / 2, math.pi / (2 * height)
-        return 2 * np.cos(middle) * math.sin(half) * (2 * math.pi / width)
+        rows = 2 * np.cos(middle) * math.sin(half) * (2 * math.pi / width)
+        return Pattern(rows[:, None], np.arange(height), np.zeros(width, np.int32))
 
     @cached_property
     @override
     def omega(self) -> NDArray[np.float32]:
-        return self._rows().astype(np.float32)[:, None]
+        return self._pattern[0]
 
     @cached_property
     @override

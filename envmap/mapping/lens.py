@@ -11,7 +11,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from chromeball.envmap.kernel import Projection
-from chromeball.envmap.mapping.base import Array, Mapping, pixel_grid, triangle
+from chromeball.envmap.mapping.base import (
+    Array,
+    Mapping,
+    Pattern,
+    each_its_own,
+    pixel_grid,
+    triangle,
+)
 from chromeball.envmap.mapping.latlong import LatLong
 from chromeball.envmap.mapping.radial import Radial
 from chromeball.scene.camera import CUBE_FACES as FACES
@@ -59,12 +66,12 @@ class Lens(Mapping):
         return self.camera.unproject(pixels)
 
     @override
-    def solid_angles(self) -> Array:
+    def pattern(self) -> Pattern:
         """Of the spherical quadrilaterals between the rays of the pixel corners."""
         d = self._corners()
         a, b, c, e = d[:-1, :-1], d[:-1, 1:], d[1:, 1:], d[1:, :-1]
         solid = np.abs(triangle(a, b, c)) + np.abs(triangle(a, c, e))
-        return np.where(np.isfinite(solid), solid, 0.0)
+        return each_its_own(np.where(np.isfinite(solid), solid, 0.0))
 
     def _corners(self) -> Array:
         return self.camera.unproject(pixel_grid(self.size, -0.5, more=1))

@@ -12,11 +12,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from chromeball.envmap.kernel import Projection
-from chromeball.envmap.mapping.base import Array, Mapping
+from chromeball.envmap.mapping.base import Array, Mapping, Pattern, each_its_own, mirrored
 from chromeball.scene.errors import UserError
 
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(6)
 _TABLE = 8192  # entries of a radial table: 3e-5 px at a radius of 1800 px
+_MANY = 5_000  # pixels from which on a smooth density stands for most
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,21 +62,27 @@ class Radial(Mapping):
         return d
 
     @override
-    def solid_angles(self) -> Array:
-        """By Green: Omega = closed integral of (1 - cos theta(min(r, rim))) dphi.
+    def pattern(self) -> Pattern:
+        middle = ((self.size[0] - 1) / 2, (self.size[1] - 1) / 2)
+        if self.centre != middle:
+            xs, ys = (np.arange(n) - c for n, c in zip(self.size, self.centre, strict=True))
+            return each_its_own(self._solid_angles(xs, ys))
+        xs, ys = (np.arange((n + 1) // 2) + (n + 1) % 2 / 2 for n in self.size)
+        return mirrored(self._solid_angles(xs, ys), self.size)
+
+    def _solid_angles(self, xs: Array, ys: Array) -> Array:
+        """Of pixels at these distances from the centre, (len(ys), len(xs)). By Green: Omega = closed integral of (1 - cos theta(min(r, rim))) dphi.
 
         Large pictures use it at the rim and the centre alone; elsewhere the density
         J + laplace(J) / 24 is exact to the fourth order of the pixel over the focal length.
         """
-        xs = np.arange(self.size[0]) - self.centre[0]
-        ys = np.arange(self.size[1]) - self.centre[1]
         fx, fy = np.abs(self.focal)
         r2 = (xs / fx)[None, :] ** 2 + (ys / fy)[:, None] ** 2
         pixel = 1 / min(fx, fy)
         exact = r2 < (self.rim + 2 * pixel) ** 2
         solid = np.zeros(r2.shape)
-        if exact.sum() > 200_000:
-            inner = max(self.rim - 4 * pixel, 0.0) ** 2
+        if exact.sum() > _MANY:
+            inner = max(self.rim - 8 * pixel, 0.0) ** 2
             smooth = (r2 < inner) & (r2 > (8 * pixel) ** 2)
             table = np.linspace(0, self.rim**2, _TABLE)
             solid[smooth] = np.interp(r2[smooth], table, self._mean_density(np.sqrt(table)))

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 import sys
-from contextlib import ExitStack
+from collections.abc import Callable, Generator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
@@ -14,6 +15,10 @@ from chromeball.cli.envmap.arguments import Json, Out, parse_numbers, print_figu
 from chromeball.cli.envmap.maps import Optics, files_of, read_map, source_map, target_map
 from chromeball.envmap.names import Kind
 from chromeball.scene.errors import UserError
+
+if TYPE_CHECKING:
+    from chromeball.envmap.picture import Radiance
+    from chromeball.scene.record import Stage
 
 #: A result finer than its source by more than this is told.
 FINER = 1.1
@@ -76,15 +81,16 @@ def warp(
         Print the figures as JSON.
 
     """
+    import numpy as np
+
     from chromeball.envmap.picture import (
+        Preview,
         latlong_attributes,
         map_from_world,
-        tone_mapped,
         write_preview,
     )
     from chromeball.envmap.probe import rotation
-    from chromeball.envmap.resample import carry
-    from chromeball.envmap.resample import warp as resample
+    from chromeball.envmap.resample import Warping, marking
     from chromeball.scene.record import Stage
 
     angles = parse_numbers(rotate, "--rotate", 3) if rotate is not None else [0.0, 0.0, 0.0]
@@ -107,7 +113,7 @@ def warp(
         target = target_map(to, width, optics, source)
     turn = rotation(*(math.radians(a) for a in angles))
     with Stage("envmap warp", inputs, to=to, fast=fast) as stage:
-        result = resample(
+        job = Warping(
             image.rgb,
             source,
             target,
@@ -116,36 +122,38 @@ def warp(
             sigma=image.sigma,
             quality="fast" if fast else "best",
         )
-        planes: list[Any] = [result.radiance, result.coverage[..., None]]
-        channels = ["R", "G", "B", "A"]
-        if result.sigma is not None:
-            planes.append(result.sigma)
-            channels += ["sigma.R", "sigma.G", "sigma.B"]
+        marks = None
         if image.clipped is not None:
-            share = carry(image.clipped, source, target, rotation=turn, valid=image.valid)
-            planes.append(share[..., None])
-            channels.append("clipped")
-            stage.figures["clipped_solid_angle"] = float((target.omega * share).sum())
-        preview = outputs[0] if len(outputs) > 1 else output
-        stage.figures |= {
-            "size": target.size,
-            "energy": result.energy,
-            "source_energy": result.source_energy,
-            "balance": result.balance,
-            "hot_pixels": result.hot_pixels,
-            "hot_energy_outside": result.outside,
-            "seen_solid_angle": float((target.omega * result.coverage).sum(dtype=float)),
-            "finer_than_source": target.density / source.density,
-            "preview": write_preview(
-                preview, "preview", tone_mapped(result.radiance, result.coverage)
-            ),
-        }
+            marks = marking(image.clipped, source, target, rotation=turn, valid=image.valid)
         turned = None
         if any(angles):
             turned = turn @ map_from_world(kept)
             kept.pop("origin", None)
         attributes = latlong_attributes(kept, rotation=turned) if to == "latlong" else kept
-        _write(stage, outputs, planes, channels, attributes)
+        preview = Preview(target.size)
+        with _files(stage, outputs, target.size, image, attributes) as append:
+            for band in job.bands():
+                planes = [band.radiance, band.coverage[..., None]]
+                if band.sigma is not None:
+                    planes.append(band.sigma)
+                if marks is not None:
+                    planes.append(marks.rows(band.first, band.last)[..., None])
+                append(np.concatenate(planes, axis=2))
+                preview.add(band.radiance, band.coverage)
+        first = outputs[0] if len(outputs) > 1 else output
+        stage.figures |= {
+            "size": target.size,
+            "energy": job.energy,
+            "source_energy": job.source_energy,
+            "balance": job.balance,
+            "hot_pixels": job.hot_pixels,
+            "hot_energy_outside": job.outside,
+            "seen_solid_angle": job.seen,
+            "finer_than_source": target.density / source.density,
+            "preview": write_preview(first, "preview", preview.picture()),
+        }
+        if marks is not None:
+            stage.figures["clipped_solid_angle"] = marks.solid_angle
     if target.density > FINER * source.density:
         print(
             f"the result is {target.density / source.density:.1f} times as fine as the picture "
@@ -155,18 +163,36 @@ def warp(
     print_figures(stage.figures, json, output)
 
 
-def _write(
-    stage: Any, outputs: list[Path], planes: list[Any], channels: list[str], attributes: Any
-) -> None:
-    """One file, or a face each."""
+@contextmanager
+def _files(
+    stage: Stage,
+    outputs: list[Path],
+    size: tuple[int, int],
+    image: Radiance,
+    attributes: dict[str, Any],
+) -> Generator[Callable[[Any], None]]:
+    """One file, or a face each, that take rows from the top: all whole, or none."""
     import numpy as np
 
-    from chromeball.scene.image import write_exr
+    from chromeball.scene.image import exr_rows
 
-    pixels = np.concatenate(planes, axis=2)
-    with ExitStack() as stack:  # all six, or none
+    channels = ["R", "G", "B", "A"]
+    channels += ["sigma.R", "sigma.G", "sigma.B"] if image.sigma is not None else []
+    channels += ["clipped"] if image.clipped is not None else []
+    size = (size[0] // len(outputs), size[1])
+    with ExitStack() as stack:
         temporaries = [stack.enter_context(stage.output(path)) for path in outputs]
-        for temporary, part in zip(
-            temporaries, np.split(pixels, len(outputs), axis=1), strict=True
-        ):
-            write_exr(temporary, part, channels=channels, attributes=attributes)
+        with ExitStack() as files:
+            appends = [
+                files.enter_context(
+                    exr_rows(path, size, channels=channels, attributes=attributes)
+                )
+                for path in temporaries
+            ]
+
+            def append(rows: Any) -> None:
+                parts = np.split(rows, len(outputs), axis=1)
+                for one, part in zip(appends, parts, strict=True):
+                    one(part)
+
+            yield append
