@@ -104,6 +104,11 @@ class Fast {
     const Index stride = 3 * Index(from_.width);
     Float4 total{};
     for (int k = 0; k < n; ++k) {
+      if (const int next = k + 12; next < n && inner[next]) {  // across rows it is far to fetch
+        const float* p = source_.rgb + stride * line[next] + 3 * Index(column[next]);
+        __builtin_prefetch(p);
+        __builtin_prefetch(p + stride);
+      }
       Float4 value{};
       const float omega = solid[k];
       if (inner[k] && omega > 0 &&

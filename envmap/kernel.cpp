@@ -121,7 +121,7 @@ class Resampling {
  public:
   Resampling(Rgb rgb, std::optional<Mask> valid, std::optional<Rgb> variance,
              const SolidAngles& source, const SolidAngles& target, const Turn& source_from_target,
-             float cap, float typical, bool smooth)
+             float cap, float typical, bool smooth, float reach)
       : rgb_(rgb),
         valid_(valid),
         variance_(variance),
@@ -130,7 +130,8 @@ class Resampling {
         source_(source_of(rgb_, valid_, source, cap)),
         turn_(matrix_of(source_from_target)),
         warp_(source_, to_, target_solid_, turn_, typical, smooth,
-              variance ? variance->data() : nullptr) {
+              variance ? variance->data() : nullptr),
+        scatter_(source_, to_, target_solid_, turn_, reach) {
     if (variance && !fits(*variance, source.map())) throw nb::value_error("sigma of another size");
   }
 
@@ -140,7 +141,7 @@ class Resampling {
       if (hot.data()[k] < 0 || hot.data()[k] >= Index(rgb_.shape(0) * rgb_.shape(1)))
         throw std::out_of_range("no such pixel");
     hot_.assign(hot.data(), hot.data() + hot.size());
-    warp_.scatter(hot_.data(), hot_.size());
+    scatter_.cut_up(hot_.data(), hot_.size());
   }
 
   auto rows(int first, int last) {
@@ -155,7 +156,7 @@ class Resampling {
     {
       nb::gil_scoped_release release;
       warp_.gather(band);
-      warp_.settle(band);
+      scatter_.settle(band);
       warp_.add_up(band);
     }
     return std::tuple(radiance, coverage, variance, energy);
@@ -176,7 +177,7 @@ class Resampling {
         for (std::size_t c = 0; c < 3; ++c) {
           double gathered = 0;
           for (std::size_t y = 0; y < h; ++y) gathered += band.energy[4 * y + c];
-          if (gathered > 0) factor[c] = ((*energy)[c] - warp_.scattered()[c]) / gathered;
+          if (gathered > 0) factor[c] = ((*energy)[c] - scatter_.energy()[c]) / gathered;
         }
         for_rows(0, to_.height, [&](int y) {
           float* row = band.radiance + 3 * std::size_t(y) * w;
@@ -184,14 +185,14 @@ class Resampling {
             for (std::size_t c = 0; c < 3; ++c) row[3 * x + c] *= float(factor[c]);
         });
       }
-      warp_.settle(band);
+      scatter_.settle(band);
       warp_.add_up(band);
     }
     return std::tuple(radiance, coverage, sums, factor);
   }
 
   void forget() { warp_.forget(); }
-  std::array<double, 3> outside() const { return warp_.tally().outside; }
+  std::array<double, 3> outside() const { return scatter_.outside(); }
 
  private:
   Rgb rgb_;
@@ -203,6 +204,7 @@ class Resampling {
   Matrix turn_;
   std::vector<Index> hot_;
   Warp warp_;
+  Scatter scatter_;
 };
 
 // Sums of each row, (H, 5), and the number of bad pixels: see survey.h.
@@ -343,10 +345,10 @@ NB_MODULE(kernel, m) {
         nb::arg("cap"));
   nb::class_<Resampling>(m, "Resampling")
       .def(nb::init<Rgb, std::optional<Mask>, std::optional<Rgb>, const SolidAngles&,
-                    const SolidAngles&, const Turn&, float, float, bool>(),
+                    const SolidAngles&, const Turn&, float, float, bool, float>(),
            nb::arg("rgb"), nb::arg("valid").none(), nb::arg("variance").none(), nb::arg("source"),
            nb::arg("target"), nb::arg("source_from_target"), nb::arg("cap"), nb::arg("typical"),
-           nb::arg("smooth"), nb::keep_alive<1, 5>(), nb::keep_alive<1, 6>())
+           nb::arg("smooth"), nb::arg("reach"), nb::keep_alive<1, 5>(), nb::keep_alive<1, 6>())
       .def("scatter", &Resampling::scatter)
       .def("rows", &Resampling::rows)
       .def("fast", &Resampling::fast, nb::arg("energy").none())

@@ -71,6 +71,7 @@ class Resampling:
         cap: float,
         typical: float,
         smooth: bool,
+        reach: float,
     ) -> None: ...
     def scatter(self, hot: NDArray[np.int64], /) -> None: ...
     def rows(

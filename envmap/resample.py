@@ -24,6 +24,9 @@ HOT = 20.0
 
 type Quality = Literal["best", "fast"]
 
+#: How far a piece of a hot pixel may reach from its middle, in target pixels.
+_REACH: dict[Quality, float] = {"best": 0.25, "fast": 0.5}
+
 
 @dataclass(frozen=True)
 class Warped:
@@ -125,8 +128,8 @@ class Warping:
     """A resampling set up, for results that are made by rows; arguments as :func:`warp`.
 
     It holds the source, the spline around the rows made last, 36 bytes a source pixel there,
-    and 32 bytes for each pair of a hot pixel and a pixel it falls on. The rows are the same, bit
-    for bit, however they are asked for; the fast way makes its result at once and holds it.
+    and 32 bytes for each pair of a hot pixel and a pixel it falls on. The rows are the same,
+    bit for bit, however they are asked for; the fast way makes its result at once and holds it.
     Energies are those of the rows made so far, each once.
     """
 
@@ -165,6 +168,7 @@ class Warping:
             found.cap,
             found.typical,
             smooth,
+            _REACH[quality],
         )
         self._kernel.scatter(hot)
         self._sums: list[NDArray[np.float64]] = []

@@ -1,6 +1,6 @@
 // Vectors, and minimax polynomials in place of libm's calls, which would take most of the time.
-// Their errors are below 3e-7 rad, float's own size. All of it is free of branches, so that the
-// loops around it turn into SIMD.
+// Their errors are below 3e-7 rad, float's own size. All of it is free of branches and always
+// inlined, so that the loops around it turn into SIMD.
 #pragma once
 
 #include <algorithm>
@@ -8,6 +8,8 @@
 #include <cstddef>
 #include <cstdint>
 #include <numbers>
+
+#define ENVMAP_INLINE [[gnu::always_inline]] inline
 
 namespace envmap {
 
@@ -38,17 +40,17 @@ struct Matrix {
 };
 
 // By value: references keep GCC from SIMD.
-inline float least(float a, float b) { return a < b ? a : b; }
-inline float most(float a, float b) { return a > b ? a : b; }
-inline float within(float a, float low, float high) { return least(most(a, low), high); }
+ENVMAP_INLINE float least(float a, float b) { return a < b ? a : b; }
+ENVMAP_INLINE float most(float a, float b) { return a > b ? a : b; }
+ENVMAP_INLINE float within(float a, float low, float high) { return least(most(a, low), high); }
 
 template <std::size_t n>
-inline float horner(const float (&c)[n], float s) {
+ENVMAP_INLINE float horner(const float (&c)[n], float s) {
   float p = c[n - 1];
   for (std::size_t k = n - 1; k-- > 0;) p = p * s + c[k];
   return p;
 }
-inline float arc_tangent(float y, float x) {
+ENVMAP_INLINE float arc_tangent(float y, float x) {
   static constexpr float c[] = {9.999999842e-01f,  -3.333306678e-01f, 1.999248358e-01f,
                                 -1.420257051e-01f, 1.063675410e-01f,  -7.495445444e-02f,
                                 4.258760747e-02f,  -1.600503050e-02f, 2.834064299e-03f};
@@ -59,7 +61,7 @@ inline float arc_tangent(float y, float x) {
   angle = x < 0 ? kPi - angle : angle;
   return y < 0 ? -angle : angle;
 }
-inline float sine(float x) {  // within a few turns
+ENVMAP_INLINE float sine(float x) {  // within a few turns
   static constexpr float c[] = {1.f,
                                 -1.666666662e-01f,
                                 8.333330978e-03f,
@@ -69,10 +71,10 @@ inline float sine(float x) {  // within a few turns
   const float k = std::nearbyint(x * (1 / kPi)), r = x - k * kPi, value = r * horner(c, r * r);
   return std::int32_t(k) & 1 ? -value : value;
 }
-inline float cosine(float x) { return sine(kPi / 2 - x); }
+ENVMAP_INLINE float cosine(float x) { return sine(kPi / 2 - x); }
 
 // Linear interpolation in a table over [0, 1].
-inline float lookup(const float* table, std::int32_t size, float u) {
+ENVMAP_INLINE float lookup(const float* table, std::int32_t size, float u) {
   const float s = within(u, 0.f, 1.f) * float(size - 1);
   const std::int32_t cell = std::int32_t(s), i = cell < size - 2 ? cell : size - 2;
   return table[i] + (s - float(i)) * (table[i + 1] - table[i]);

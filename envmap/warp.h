@@ -1,47 +1,14 @@
 // Resampling that keeps the energy of small bright lights.
 //
 // The source is split into L = base + hot. `base` is gathered: L_j = sum_k L(R d_k) J_k / sum_k J_k
-// over sub-samples of the target pixel's footprint. `hot`, what rises above a cap, is cut into
-// pieces smaller than a target pixel and scattered as energy, L dOmega over the exact Omega_j, so
-// that none of it falls between the samples.
+// over sub-samples of the target pixel's footprint. `hot`, what rises above a cap, is scattered.
 #pragma once
 
-#include <tbb/blocked_range.h>
-#include <tbb/parallel_for.h>
-#include <tbb/parallel_sort.h>
-
-#include <limits>
 #include <optional>
 
-#include "source.h"
+#include "scatter.h"
 
 namespace envmap {
-
-inline void for_rows(int first, int last, const auto& body) {
-  tbb::parallel_for(tbb::blocked_range<int>(first, last), [&](const auto& rows) {
-    for (int y = rows.begin(); y != rows.end(); ++y) body(y);
-  });
-}
-
-// Rows of the result, from `first` on.
-struct Band {
-  int first, last;
-  float* radiance;
-  float* coverage;
-  float* variance;  // null: not asked for
-  double* energy;   // 4 a row: sums of L times the seen solid angle, and of that
-};
-
-// Energy that falls on a pixel, in quanta: integers do not depend on the order of addition.
-struct Deposit {
-  Index pixel;
-  std::array<std::int64_t, 3> energy;
-};
-
-struct Tally {
-  Index cells = 0;
-  std::array<double, 3> outside{};
-};
 
 class Warp {
  public:
@@ -52,7 +19,6 @@ class Warp {
         to_(to),
         target_solid_(target_solid),
         source_from_target_(rotation),
-        target_from_source_(rotation.transposed()),
         typical_(typical),
         variance_(variance) {
     if (smooth) spline_.emplace(source);
@@ -69,60 +35,6 @@ class Warp {
       gather_row(y, band.radiance + 3 * row, band.coverage + row,
                  band.variance ? band.variance + 3 * row : nullptr);
     });
-  }
-
-  // Cut the hot cells up; before `settle`.
-  void scatter(const Index* hot, std::size_t count) {
-    tally_ = {};
-    tally_.cells = Index(count);
-    std::array<double, 3> energy{};
-    for (std::size_t n = 0; n < count; ++n)
-      for (std::size_t c = 0; c < 3; ++c) energy[c] += above(hot[n], c);
-    scattered_ = energy;
-    for (std::size_t c = 0; c < 3; ++c)
-      quantum_[c] = std::max(energy[c], std::numeric_limits<double>::min()) * 0x1p-60;
-    constexpr std::size_t chunk = 256;
-    std::vector<std::vector<Deposit>> parts((count + chunk - 1) / chunk);
-    tbb::parallel_for(std::size_t(0), parts.size(), [&](std::size_t part) {
-      std::vector<Piece> pieces;
-      for (std::size_t n = part * chunk; n < std::min(count, (part + 1) * chunk); ++n)
-        scatter_cell(hot[n], pieces, parts[part]);
-    });
-    deposits_.clear();
-    std::size_t all = 0;
-    for (const auto& part : parts) all += part.size();
-    deposits_.reserve(all);
-    for (auto& part : parts) {
-      deposits_.insert(deposits_.end(), part.begin(), part.end());
-      std::vector<Deposit>().swap(part);
-    }
-    tbb::parallel_sort(deposits_.begin(), deposits_.end(),
-                       [](const Deposit& a, const Deposit& b) { return a.pixel < b.pixel; });
-  }
-
-  // Energy above the cap.
-  const std::array<double, 3>& scattered() const { return scattered_; }
-
-  // Add what falls on a band whose base is gathered.
-  void settle(const Band& band) {
-    const Index first = Index(band.first) * to_.width, last = Index(band.last) * to_.width;
-    auto d = std::lower_bound(deposits_.begin(), deposits_.end(), first,
-                              [](const Deposit& a, Index k) { return a.pixel < k; });
-    while (d != deposits_.end() && d->pixel < last) {
-      const Index k = d->pixel;
-      std::array<std::int64_t, 3> sum{};
-      for (; d != deposits_.end() && d->pixel == k; ++d)
-        for (std::size_t c = 0; c < 3; ++c) sum[c] += d->energy[c];
-      const double solid = target_solid_(k % to_.width, k / to_.width);
-      const double seen = solid * band.coverage[k - first];
-      for (std::size_t c = 0; c < 3; ++c) {
-        const double e = double(sum[c]) * quantum_[c];
-        if (seen > 0)
-          band.radiance[3 * (k - first) + Index(c)] += float(e / seen);
-        else
-          tally_.outside[c] += e;
-      }
-    }
   }
 
   // Sums of a band that is settled.
@@ -145,16 +57,6 @@ class Warp {
     });
   }
 
-  // After all bands: hot energy that the target does not see.
-  Tally tally() const {
-    Tally result = tally_;
-    for (const Deposit& d : deposits_) {
-      if (d.pixel >= 0) break;
-      for (std::size_t c = 0; c < 3; ++c) result.outside[c] += double(d.energy[c]) * quantum_[c];
-    }
-    return result;
-  }
-
  private:
   // The solid angles of a row of the target.
   const float* solids_of(int y) const {
@@ -166,11 +68,6 @@ class Warp {
 
   struct Sampling {
     int across, down;
-  };
-  // A piece of a hot cell: the pixel it lands on, or -1, and its share.
-  struct Piece {
-    Index pixel;
-    float weight;
   };
   // Weights of source pixels in one target pixel, by an open hash.
   struct Weights {
@@ -381,86 +278,14 @@ class Warp {
     w.open(-1);
   }
 
-  double above(Index k, std::size_t c) const {
-    const float* rgb = source_.rgb + 3 * k;
-    return double(rgb[c]) * (1 - base_share(rgb, source_.cap)) *
-           double(source_.solid(k % from_.width, k / from_.width));
-  }
-
-  void scatter_cell(Index k, std::vector<Piece>& pieces, std::vector<Deposit>& deposits) const {
-    pieces.clear();
-    cut(float(k % from_.width), float(k / from_.width), 0.5f, 0, pieces);
-    double total = 0;
-    for (const Piece& piece : pieces) total += piece.weight;
-    if (!(total > 0)) pieces.assign(1, {-1, 1.f}), total = 1;
-    std::sort(pieces.begin(), pieces.end(),
-              [](const Piece& a, const Piece& b) { return a.pixel < b.pixel; });
-    for (std::size_t n = 0; n < pieces.size();) {
-      const Index pixel = pieces[n].pixel;
-      double share = 0;
-      for (; n < pieces.size() && pieces[n].pixel == pixel; ++n) share += pieces[n].weight;
-      Deposit d{pixel, {}};
-      for (std::size_t c = 0; c < 3; ++c)
-        d.energy[c] = std::int64_t(share / total * above(k, c) / quantum_[c]);
-      deposits.push_back(d);
-    }
-  }
-
-  // Distance in target pixels, around the seam of a panorama; far where the sheets differ.
-  float apart(const Places& p, int a, int b) const {
-    if (p.sheet[a] != p.sheet[b]) return std::numeric_limits<float>::max();
-    float dx = std::abs(p.x[b] - p.x[a]);
-    if (to_.round()) dx = std::min(dx, float(to_.width) - dx);
-    return std::max(dx, std::abs(p.y[b] - p.y[a]));
-  }
-
-  // Cut a cell into pieces no larger than half a target pixel.
-  void cut(float x, float y, float half, int depth, std::vector<Piece>& pieces) const {
-    const float e = half * 0.999f;
-    const float u[5] = {x, x - e, x + e, x - e, x + e}, v[5] = {y, y - e, y - e, y + e, y + e};
-    thread_local Rays rays;
-    thread_local Places at;
-    from_.unproject(u, v, 5, rays);
-    rays.turn(target_from_source_, 5);
-    to_.project(rays, 5, at);
-    const bool here = rays.jacobian[0] > 0, lands = here && at.sheet[0] >= 0;
-    bool fine = depth > 0;  // at least four pieces
-    for (int k = 1; depth < 7 && k < 5; ++k) {
-      const bool ok = rays.jacobian[k] > 0, in = ok && at.sheet[k] >= 0;
-      if (ok != here || in != lands)
-        fine = fine && depth >= 3;  // the rim of a lens: a few pieces suffice
-      else if (in && apart(at, 0, k) > 0.25f)
-        // at the edge of a cube's face small pieces fall on either side
-        fine = fine && depth >= 4 && at.sheet[k] != at.sheet[0];
-    }
-    if (fine || depth >= 7) {
-      if (!here) return;
-      Index pixel = -1;
-      if (lands) {
-        const Cell c = to_.nearest(at.sheet[0], at.x[0], at.y[0]);
-        if (target_solid_(c.x, c.y) > 0) pixel = Index(c.y) * to_.width + c.x;
-      }
-      pieces.push_back({pixel, 4 * half * half * rays.jacobian[0]});
-      return;
-    }
-    const float h = half / 2;
-    cut(x - h, y - h, h, depth + 1, pieces);
-    cut(x + h, y - h, h, depth + 1, pieces);
-    cut(x - h, y + h, h, depth + 1, pieces);
-    cut(x + h, y + h, h, depth + 1, pieces);
-  }
-
   const Source& source_;
   const Projection& from_;
   const Projection& to_;
   const Solid& target_solid_;
-  Matrix source_from_target_, target_from_source_;
+  Matrix source_from_target_;
   float typical_;
   const float* variance_;  // of the source, (H, W, 3)
   mutable std::optional<Histospline> spline_;
-  std::array<double, 3> quantum_{}, scattered_{};
-  std::vector<Deposit> deposits_;
-  Tally tally_;
 };
 
 }  // namespace envmap

@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 from chromeball.envmap.kernel import Projection
 from chromeball.envmap.mapping.base import Array, Mapping, Pattern, mirrored, triangle
 
-
 _COARSE = 96  # pixels of a quarter's side below which every pixel is made of triangles
 
 

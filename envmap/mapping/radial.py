@@ -65,13 +65,18 @@ class Radial(Mapping):
     def pattern(self) -> Pattern:
         middle = ((self.size[0] - 1) / 2, (self.size[1] - 1) / 2)
         if self.centre != middle:
-            xs, ys = (np.arange(n) - c for n, c in zip(self.size, self.centre, strict=True))
+            xs, ys = (
+                np.arange(n, dtype=float) - c
+                for n, c in zip(self.size, self.centre, strict=True)
+            )
             return each_its_own(self._solid_angles(xs, ys))
-        xs, ys = (np.arange((n + 1) // 2) + (n + 1) % 2 / 2 for n in self.size)
+        xs, ys = (np.arange((n + 1) // 2, dtype=float) + (n + 1) % 2 / 2 for n in self.size)
         return mirrored(self._solid_angles(xs, ys), self.size)
 
     def _solid_angles(self, xs: Array, ys: Array) -> Array:
-        """Of pixels at these distances from the centre, (len(ys), len(xs)). By Green: Omega = closed integral of (1 - cos theta(min(r, rim))) dphi.
+        """Of pixels at these distances from the centre, (len(ys), len(xs)).
+
+        By Green: Omega = closed integral of (1 - cos theta(min(r, rim))) dphi.
 
         Large pictures use it at the rim and the centre alone; elsewhere the density
         J + laplace(J) / 24 is exact to the fourth order of the pixel over the focal length.

@@ -11,6 +11,7 @@ from chromeball.envmap.mapping import (
     MAPPINGS,
     SIX,
     Cube,
+    Lens,
     Mapping,
     Radial,
     ball_distance,
@@ -89,11 +90,14 @@ def test_solid_angles_sum_to_the_total(name: str) -> None:
     assert MAPS[name].solid_angles().sum() == pytest.approx(TOTALS[name], rel=1e-6)
 
 
+MANY = sphere(150_000, seed=3)
+
+
 @pytest.mark.parametrize("name", MAPS)
 def test_solid_angle_of_a_pixel_by_sampling(name: str) -> None:
     """Two routes: the exact sum against counting uniform directions."""
     mapping = MAPS[name]
-    d = sphere(400_000, seed=3)
+    d = MANY
     pixels = mapping.project(d)
     width, height = mapping.size
     with np.errstate(invalid="ignore"):
@@ -121,6 +125,40 @@ def test_large_disc_takes_the_fast_route_to_the_same_solid_angles() -> None:
     small = make_mapping("angular", (256, 256)).solid_angles()
     blocks = total.reshape(256, 4, 256, 4).sum(axis=(1, 3))
     np.testing.assert_allclose(blocks, small, rtol=1e-5, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["angular", "mirror", "paraboloid", "ball at 3 radii"])
+def test_smooth_discs_take_the_fast_route_to_the_same_solid_angles(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mapping = mirror_ball((161, 161), 3.0) if name not in MAPPINGS else MAPS[name]
+    monkeypatch.setattr("chromeball.envmap.mapping.radial._MANY", 0)
+    fast = mapping.solid_angles()
+    monkeypatch.setattr("chromeball.envmap.mapping.radial._MANY", 1 << 30)
+    slow = mapping.solid_angles()
+    assert (fast != slow).any()
+    np.testing.assert_allclose(fast, slow, rtol=2e-6)
+
+
+def test_fine_octahedral_takes_the_fast_route_to_the_same_solid_angles(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    mapping = make_mapping("octahedral", (400, 400))
+    fast = mapping.solid_angles()
+    monkeypatch.setattr("chromeball.envmap.mapping.octahedral._COARSE", 1000)
+    slow = mapping.solid_angles()
+    assert (fast != slow).any()
+    np.testing.assert_allclose(fast, slow, rtol=1e-7)
+    assert fast.sum() == pytest.approx(4 * math.pi, rel=1e-9)
+
+
+@pytest.mark.parametrize("name", [n for n, m in MAPS.items() if not isinstance(m, Lens)])
+def test_solid_angles_of_the_kernel_are_the_same(name: str) -> None:
+    mapping = MAPS[name]
+    np.testing.assert_array_equal(
+        mapping.solid.rows(0, mapping.size[1]), mapping.solid_angles().astype(np.float32)
+    )
+    assert mapping.solid.total() == pytest.approx(mapping.solid_angles().sum(), rel=1e-6)
 
 
 @pytest.mark.parametrize("name", MAPS)

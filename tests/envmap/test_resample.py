@@ -18,7 +18,7 @@ from chromeball.envmap.mapping import (
     sized,
 )
 from chromeball.envmap.probe import rotation
-from chromeball.envmap.resample import Quality, carry, warp
+from chromeball.envmap.resample import Quality, Warping, carry, warp
 from chromeball.scene.camera import CameraModel
 
 NAMES = [name for name, entry in MAPPINGS.items() if entry.total > 12]
@@ -82,10 +82,16 @@ def test_constant_stays_constant(to: str, width: int) -> None:
     assert (result.coverage[~seen] == 0).all()
 
 
-@pytest.mark.parametrize("to", NAMES)
-@pytest.mark.parametrize("width", [96, 320])
+def as_fine(width: int, fine: bool) -> list[tuple[str, int]]:
+    """Widths of all whole maps, coarse or about as fine as a lat-long of `width`."""
+    share = {"latlong": 1.0, "cube-vertical": 0.75, "cube-strip": 1.5, "cube-column": 0.25}
+    scale = 1.0 if fine else 0.3
+    return [(name, int(scale * width * share.get(name, 0.75))) for name in NAMES]
+
+
+@pytest.mark.parametrize(("to", "width"), [*as_fine(160, True), *as_fine(160, False)])
 def test_smooth_radiance_against_the_analytic_function(to: str, width: int) -> None:
-    source = LatLong((320, 160))
+    source = LatLong((160, 80))
     target = at_width(to, width)
     result = warp(area_mean(source, 2), source, target)
     solid = target.solid_angles()
@@ -94,11 +100,11 @@ def test_smooth_radiance_against_the_analytic_function(to: str, width: int) -> N
     expected = area_mean(target)
     inner = whole & np.isfinite(target.directions()).all(axis=2)
     rms = np.sqrt(np.mean((result.radiance[inner] - expected[inner]) ** 2))
-    assert rms < 0.008
+    assert rms < (0.008 if len(expected) > 48 else 0.012)  # the reference's own in the poles
 
 
 @pytest.mark.parametrize("position", range(6))
-@pytest.mark.parametrize("width", [64, 256, 1024])
+@pytest.mark.parametrize("width", [64, 256, 512])
 def test_fisheye_to_latlong_keeps_a_sun(position: int, width: int) -> None:
     """The bar: energy to 0.1 % with a sun of 1e5, up and down."""
     sun = suns(6, 5)[position] * [1, 1, 0] + [0, 0, abs(suns(6, 5)[position][2])]
@@ -111,22 +117,22 @@ def test_fisheye_to_latlong_keeps_a_sun(position: int, width: int) -> None:
     assert (result.outside == 0).all()
 
 
-@pytest.mark.parametrize("to", NAMES)
-@pytest.mark.parametrize("width", [48, 320])
+@pytest.mark.parametrize(("to", "width"), [*as_fine(192, True), *as_fine(192, False)])
 def test_every_map_keeps_suns(to: str, width: int) -> None:
-    source = LatLong((256, 128))
+    source = LatLong((192, 96))
     target = at_width(to, width)
+    solid, directions = target.solid_angles(), np.nan_to_num(target.directions())
     poles = np.array([[0, 1, 0], [0, -1, 0], [0, 0, -1], [-1e-3, 0, -1]], float)
-    for sun in np.concatenate([suns(4, 6), poles]):
+    for sun in np.concatenate([suns(2, 6), poles]):
         sun = sun / np.linalg.norm(sun)
         result = warp(with_sun(source, sun, 1.5), source, target)
         np.testing.assert_allclose(result.energy, result.source_energy, rtol=1e-3)
         assert result.radiance.min() >= 0
         # and where it was: the centroid of what is brighter than anything around
-        hot = result.radiance[..., 0] * target.solid_angles() * (result.radiance[..., 0] > 50)
-        centroid = np.einsum("hw,hwk->k", hot, np.nan_to_num(target.directions()))
+        hot = result.radiance[..., 0] * solid * (result.radiance[..., 0] > 50)
+        centroid = np.einsum("hw,hwk->k", hot, directions)
         cosine = centroid @ sun / np.linalg.norm(centroid)
-        pixel = math.sqrt(4 * math.pi / (target.solid_angles() > 0).sum())
+        pixel = math.sqrt(4 * math.pi / (solid > 0).sum())
         assert cosine > math.cos(1.5 * pixel + math.radians(1))
 
 
@@ -167,7 +173,7 @@ def test_area_mode_against_a_plain_reference() -> None:
     source, target = LatLong((256, 128)), make_mapping("angular", (32, 32))
     radiance = rng.random((128, 256, 3)).astype(np.float32)
     got = warp(radiance, source, target, smooth=False)
-    cut, total, weight = 12, np.zeros((32, 32, 3)), np.zeros((32, 32))
+    cut, total, weight = 8, np.zeros((32, 32, 3)), np.zeros((32, 32))
     for j in range(cut):
         for i in range(cut):
             offset = np.array([i + 0.5, j + 0.5]) / cut - 0.5
@@ -236,6 +242,24 @@ def test_a_sun_the_target_does_not_see_is_counted() -> None:
     result = warp(radiance, source, make_mapping("paraboloid", (32, 32)))
     np.testing.assert_allclose(result.outside, result.source_energy, rtol=2e-2)
     assert result.radiance.max() == 0
+
+
+@pytest.mark.parametrize("to", ["latlong", "cube", "angular"])
+@pytest.mark.parametrize("smooth", [True, False])
+def test_rows_are_the_whole_bit_for_bit(to: str, smooth: bool) -> None:
+    source, target = LatLong((300, 150)), at_width(to, 120)
+    lit = with_sun(source, np.array([0.3, 0.5, 0.81]), 4)
+    turn, sigma = rotation(0.7, -0.3, 0.2), 0.1 * np.ones_like(lit)
+    job = Warping(lit, source, target, rotation=turn, smooth=smooth, sigma=sigma)
+    bands = list(job.bands(17))
+    again = Warping(lit, source, target, rotation=turn, smooth=smooth, sigma=sigma)
+    whole = again.rows(0, target.size[1])
+    for name in ("radiance", "coverage", "sigma"):
+        parts = np.concatenate([getattr(band, name) for band in bands])
+        np.testing.assert_array_equal(parts, getattr(whole, name))
+    assert (job.energy == again.energy).all()
+    assert job.seen == again.seen == pytest.approx(4 * math.pi, rel=1e-5)
+    assert (job.rows(3, 9).radiance == whole.radiance[3:9]).all()  # after what was freed
 
 
 def test_same_inputs_same_outputs() -> None:
@@ -324,7 +348,7 @@ def test_fast_way_of_a_part_of_the_sphere() -> None:
 
 @pytest.mark.parametrize(("to", "width"), [("latlong", 64), ("latlong", 128), ("cube", 64)])
 def test_sigma_is_the_scatter_of_repeated_noise(to: str, width: int) -> None:
-    """Two routes: propagated through the weights, and counted over 300 noisy maps."""
+    """Two routes: propagated through the weights, and counted over 200 noisy maps."""
     rng = np.random.default_rng(12)
     source, target = LatLong((64, 32)), at_width(to, width)
     clean = area_mean(source, 2) + 3
@@ -336,14 +360,14 @@ def test_sigma_is_the_scatter_of_repeated_noise(to: str, width: int) -> None:
             target,
             smooth=True,
         ).radiance
-        for _ in range(300)
+        for _ in range(200)
     ]
     counted = np.std(runs, axis=0, ddof=1)
     found = warp(clean, source, target, sigma=sigma, smooth=True)
     assert found.sigma is not None
     inner = target.solid_angles() > 0.5 * np.median(target.omega[target.omega > 0])
     ratio = (found.sigma / np.maximum(counted, 1e-9))[inner]
-    # the scatter of a deviation counted in 300 is 4 %; at faces' edges neighbours are guessed
+    # the scatter of a deviation counted in 200 is 5 %; at faces' edges neighbours are guessed
     assert abs(np.median(ratio) - 1) < 0.03
     assert np.quantile(np.abs(ratio - 1), 0.95) < 0.2
     plain = warp(clean, source, target, smooth=True)
@@ -368,7 +392,7 @@ def test_marks_are_carried_along() -> None:
         target = at_width(to, width)
         share = carry(mask, source, target)
         assert share.max() <= 1
-        assert float((share * target.omega).sum()) == pytest.approx(marked, rel=0.06)
+        assert float((share * target.omega).sum()) == pytest.approx(marked, rel=2e-3)
 
 
 @pytest.mark.parametrize("quality", ["best", "fast"])
