@@ -381,3 +381,43 @@ def test_one_line_and_exit_code(tmp_path: Path) -> None:
     assert done.returncode == 2
     assert done.stderr.strip() == "chromeball: none.exr: no such picture"
     assert not list(tmp_path.iterdir())
+
+
+def test_warp_leaves_out_what_a_mask_does(tmp_path: Path) -> None:
+    """The right half is masked; it is not read, even where it is enormous."""
+    rgb = np.ones((16, 32, 3), np.float32)
+    rgb[:, 16:] = 1e6
+    write_exr(tmp_path / "in.exr", rgb)
+    mask = np.ones((16, 32, 1), np.float32)
+    mask[:, 16:] = 0
+    write_exr(tmp_path / "mask.exr", mask, channels=("Y",))
+    warp = ("envmap", "warp", tmp_path / "in.exr", "--from", "latlong", "--to", "latlong")
+    out = tmp_path / "out.exr"
+    run(*warp, "--mask", tmp_path / "mask.exr", "-o", out)
+    got = read_image(out).pixels
+    np.testing.assert_allclose(got[:, :15], 1, rtol=1e-5)
+    assert (got[:, 17:] == 0).all()
+    record = read_json(tmp_path / "out.exr.record.json")
+    assert str(tmp_path / "mask.exr") in record["inputs"]
+    assert record["figures"]["seen_solid_angle"] == pytest.approx(2 * math.pi, rel=1e-5)
+    write_exr(tmp_path / "small.exr", mask[:8], channels=("Y",))
+    with pytest.raises(UserError, match="is 32x16"):
+        run(*warp, "--mask", tmp_path / "small.exr", "-o", out)
+
+
+def test_warp_reads_tiles_as_it_reads_rows(tmp_path: Path) -> None:
+    rgb = np.random.default_rng(2).random((150, 300, 3)).astype(np.float32)
+    write_exr(tmp_path / "rows.exr", rgb)
+    spec = oiio.ImageSpec(300, 150, 3, "float")
+    spec.tile_width = spec.tile_height = 64
+    file = oiio.ImageOutput.create(str(tmp_path / "tiles.exr"))
+    assert file.open(str(tmp_path / "tiles.exr"), spec)
+    assert file.write_image(rgb)
+    assert file.close()
+    for name in ("rows", "tiles"):
+        run(
+            *("envmap", "warp", tmp_path / f"{name}.exr", "--from", "latlong", "--to", "cube"),
+            *("-o", tmp_path / f"{name}.cube.exr"),
+        )
+    rows, tiles = (read_image(tmp_path / f"{n}.cube.exr").pixels for n in ("rows", "tiles"))
+    np.testing.assert_array_equal(rows, tiles)

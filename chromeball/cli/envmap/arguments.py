@@ -84,6 +84,21 @@ def read_camera(path: Path, size: tuple[int, int] | None, picture: Path | None) 
     return model
 
 
+def read_mask(path: Path, size: tuple[int, int], file: Path) -> Any:
+    """(H, W) bool, true where the mask is brighter than half."""
+    from chromeball.scene.image import read_image
+
+    image = read_image(path)
+    pixels = image.pixels[..., : min(3, image.pixels.shape[2])].astype(float).mean(axis=2)
+    if pixels.shape != (size[1], size[0]):
+        raise UserError(
+            f"{pixels.shape[1]}x{pixels.shape[0]}, but {file.name} is {size[0]}x{size[1]}",
+            file=path,
+        )
+    white = 1.0 if image.linear else float(2 ** (8 * image.pixels.dtype.itemsize) - 1)
+    return pixels > white / 2
+
+
 def source_fisheye(
     lens: str | None, camera: Path | None, size: tuple[int, int], picture: Path
 ) -> Mapping:

@@ -18,6 +18,7 @@ from chromeball.cli.envmap.arguments import (
     parse_numbers,
     print_figures,
     read_camera,
+    read_mask,
     write_panorama,
 )
 from chromeball.scene.errors import UserError
@@ -407,7 +408,7 @@ def _shot(request: _Request, k: int, image: Radiance) -> tuple[Shot, float | Non
     rgb, valid, clipped = image.rgb, image.valid, image.clipped
     mask = request.masks[k]
     if mask is not None:
-        allowed = _read_mask(mask, image.size, file)
+        allowed = read_mask(mask, image.size, file)
         valid = allowed if valid is None else valid & allowed
     if ball is not None:
         x, y, radius = ball
@@ -453,21 +454,6 @@ def _camera(lens: str | Path | None, size: tuple[int, int], file: Path) -> Camer
     if isinstance(lens, Path):
         return read_camera(lens, size, file)
     return None if lens is None else parse_lens(lens, size)
-
-
-def _read_mask(path: Path, size: tuple[int, int], file: Path) -> Any:
-    """(H, W) bool, true where the mask is brighter than half."""
-    from chromeball.scene.image import read_image
-
-    image = read_image(path)
-    pixels = image.pixels[..., : min(3, image.pixels.shape[2])].astype(float).mean(axis=2)
-    if pixels.shape != (size[1], size[0]):
-        raise UserError(
-            f"{pixels.shape[1]}x{pixels.shape[0]}, but {file.name} is {size[0]}x{size[1]}",
-            file=path,
-        )
-    white = 1.0 if image.linear else float(2 ** (8 * image.pixels.dtype.itemsize) - 1)
-    return pixels > white / 2
 
 
 def _complete(request: _Request, radiance: Any, missing: Any) -> tuple[Any, float | None]:

@@ -6,12 +6,19 @@ import math
 import sys
 from collections.abc import Callable, Generator
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from chromeball.cli.envmap.arguments import Json, Out, parse_numbers, print_figures
+from chromeball.cli.envmap.arguments import (
+    Json,
+    Out,
+    parse_numbers,
+    print_figures,
+    read_mask,
+)
 from chromeball.cli.envmap.maps import Optics, files_of, read_map, source_map, target_map
 from chromeball.envmap.names import Kind
 from chromeball.scene.errors import UserError
@@ -37,6 +44,7 @@ def warp(
     ball_distance: float | None = None,
     focal: float | None = None,
     rotate: str | None = None,
+    mask: Path | None = None,
     fast: Annotated[bool, Parameter(negative="")] = False,
     output: Out,
     json: Json = False,
@@ -73,6 +81,9 @@ def warp(
     rotate
         YAW,PITCH,ROLL in degrees by which the world is turned: what lay ahead moves to the
         left by yaw (right-handed about +Y), up by pitch; roll is clockwise.
+    mask
+        A picture of the same size, six side by side with cube-files: what is not brighter than
+        half is left out.
     fast
         One linear sample a pixel: the energy is kept, edges are softer.
     output
@@ -98,9 +109,12 @@ def warp(
         raise UserError(f"--width {width}: it must be from 1 to 65536")
     optics = Optics(lens, to_lens, camera, ball_distance, focal)
     optics.check(from_, to)
-    inputs = [*files_of(picture, from_), *([camera] if camera else [])]
+    inputs = [*files_of(picture, from_), *(path for path in (camera, mask) if path)]
     outputs = files_of(output, to)
     image = read_map(picture, from_)
+    if mask is not None:
+        allowed = read_mask(mask, image.size, picture)
+        image = replace(image, valid=allowed if image.valid is None else image.valid & allowed)
     kept = dict(image.attributes)
     if from_ in ("fisheye", "mirror"):
         kept.pop("worldToCamera", None)  # of a camera's axes, not a map's
