@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from chromeball.envmap.ball import BallCamera
 from chromeball.envmap.mapping import LatLong, Lens, Mapping, Radial
 from chromeball.envmap.refine import REACH, Refined, refine_turns
-from chromeball.envmap.resample import Warped, warp
+from chromeball.envmap.resample import Warped, carry, warp
 from chromeball.scene.camera import WORLD_FROM_LATLONG
 from chromeball.scene.color import luminance
 from chromeball.scene.errors import UserError
@@ -33,9 +33,9 @@ class Shot:
     """One radiance picture of the probe.
 
     ``radiance`` (H, W, 3) float32; ``mapping`` its pixels' directions in camera axes;
-    ``valid`` (H, W) or None; ``yaw`` about the vertical, right-handed, ``pitch`` up and
-    ``roll`` clockwise, radians. ``photographer``: half angle of the cone about the direction
-    back to a ball's camera that is not used, radians.
+    ``valid`` and ``clipped`` (H, W) or None, the latter lower bounds; ``yaw`` about the
+    vertical, right-handed, ``pitch`` up and ``roll`` clockwise, radians. ``photographer``:
+    half angle of the cone about the direction back to a ball's camera that is not used.
     """
 
     radiance: NDArray[np.float32]
@@ -45,6 +45,7 @@ class Shot:
     roll: float = 0.0
     valid: NDArray[np.bool_] | None = None
     photographer: float = 0.0
+    clipped: NDArray[np.bool_] | None = None
 
 
 @dataclass(frozen=True)
@@ -65,11 +66,13 @@ class Overlap:
 class Panorama:
     """``radiance`` (H, W, 3), black where unseen, and ``alpha`` (H, W), the seen part.
 
+    ``clipped`` (H, W) is the part that was too bright for every exposure, None if none was.
     ``energy_error`` per shot: what resampling changed, relative.
     """
 
     radiance: NDArray[np.float32]
     alpha: NDArray[np.float32]
+    clipped: NDArray[np.float32] | None
     overlaps: tuple[Overlap, ...]
     energy_error: tuple[float, ...]
     hot_pixels: int
@@ -146,6 +149,7 @@ def combine(shots: Sequence[Shot], rotations: Sequence[Array], width: int) -> Pa
     total = np.zeros((*solid.shape, 3), np.float32)
     weights = np.zeros(solid.shape, np.float32)
     alpha = np.zeros(solid.shape, np.float32)
+    clipped = np.zeros(solid.shape, np.float32)
     seen: list[tuple[NDArray[np.float32], NDArray[np.bool_]]] = []
     errors: list[float] = []
     hot = 0
@@ -158,14 +162,21 @@ def combine(shots: Sequence[Shot], rotations: Sequence[Array], width: int) -> Pa
         total += weight[..., None] * result.radiance
         weights += weight
         alpha = np.maximum(alpha, np.where(weight > 0, result.coverage, 0))
+        if shot.clipped is not None and shot.clipped.any():
+            turned = turn @ shot.mapping.rotation.T
+            clipped += weight * carry(
+                shot.clipped, shot.mapping, target, rotation=turned, valid=shot.valid
+            )
         inner = (result.coverage > 0.999) & (weight > 5e-4)  # to 98.5 % of the rim
         if len(shots) > 1:
             seen.append((luminance(result.radiance).astype(np.float32), inner))
     known = weights > 0
     total[known] /= weights[known][:, None]
+    clipped[known] /= weights[known]
     return Panorama(
         radiance=total,
         alpha=alpha,
+        clipped=clipped if clipped.any() else None,
         overlaps=_overlaps(seen, solid),
         energy_error=tuple(errors),
         hot_pixels=hot,

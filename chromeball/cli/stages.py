@@ -18,7 +18,17 @@ import msgspec
 
 from chromeball.renderer.inputs import scene_inputs
 from chromeball.scene.errors import UserError
-from chromeball.scene.manifest import Align, Bracket, Lens, Meter, Probe, Quad, Scene, View
+from chromeball.scene.manifest import (
+    Align,
+    Bracket,
+    Lens,
+    Meter,
+    Object,
+    Probe,
+    Quad,
+    Scene,
+    View,
+)
 from chromeball.scene.sequence import at, frames_of, moves
 
 # the suffixes of `chromeball.scene.image`, which is too heavy to import for a plan
@@ -121,9 +131,9 @@ class _Planner:
         plan += [self._merge(bracket) for bracket in first]
         plan += [self._lens(), self._align()]
         plan += [self._pose(view) for view in scene.view]
-        plan.append(self._probe())
+        plan += [self._probe(), self._sun()]
         plan += self._stand_in()
-        plan.append(self._lights())
+        plan += [self._lights(), self._harmonics(), self._prefilter()]
         for view in scene.view:
             plan += self._render(view)
         plan.append(self._report(plan))
@@ -479,6 +489,10 @@ class _Planner:
     def _env(self) -> str:
         return f"{self.build}/env.exr"
 
+    def _seen(self) -> str:
+        """The map before its sun is restored."""
+        return f"{self.build}/env_seen.exr" if self.scene.env.sun else self._env()
+
     def _align(self) -> StagePlan:
         name = "envmap align"
         align, probe = self.scene.align, self.scene.probe
@@ -516,8 +530,8 @@ class _Planner:
                 True,
                 f"{scene.env.file} is a finished panorama: turned to world axes, not stitched",
                 (scene.env.file, *aligned),
-                (self._env(),),
-                ("chromeball", "envmap", "probe", self.file, "-o", self._env()),
+                (self._seen(),),
+                ("chromeball", "envmap", "probe", self.file, "-o", self._seen()),
                 {"env": {"file": scene.env.file, "width": scene.env.width}},
             )
         if probe is None:
@@ -562,7 +576,7 @@ class _Planner:
         if scene.align:
             options += _option("align", f"{self.build}/align.json")
             inputs.append(f"{self.build}/align.json")
-        output = f"{self.build}/env.exr"
+        output = self._seen()
         return StagePlan(
             name,
             True,
@@ -605,11 +619,37 @@ class _Planner:
             True,
             f"{len(merged)} shots, where they looked is refined from the pictures",
             tuple(inputs),
-            (self._env(),),
+            (self._seen(),),
             (
                 *("chromeball", "envmap", "stitch", *merged, *options),
-                *("--width", str(env.width), "-o", self._env()),
+                *("--width", str(env.width), "-o", self._seen()),
             ),
+            {},
+        )
+
+    def _sun(self) -> StagePlan:
+        name, sun = "envmap sun", self.scene.env.sun
+        if sun is None:
+            return StagePlan(name, False, "no [env.sun]: the map is as it was seen")
+        if (sun.meter is None) == (sun.ratio is None):
+            raise UserError("[env.sun] needs a meter's reading or a ratio, one of the two")
+        options: list[str] = []
+        for key in ("meter", "ratio", "normal", "at", "clipped", "color", "radius", "accuracy"):
+            value = getattr(sun, key)
+            if isinstance(value, str):
+                options += _option(key, value)
+            elif value is not None:
+                options += _option(
+                    key, _numbers(value if isinstance(value, tuple) else [value])
+                )
+        return StagePlan(
+            name,
+            True,
+            "the sun's light from a "
+            + ("light meter's reading" if sun.meter is not None else "card in sun and shadow"),
+            (self._seen(),),
+            (self._env(),),
+            ("chromeball", "envmap", "sun", self._seen(), *options, "-o", self._env()),
             {},
         )
 
@@ -630,6 +670,53 @@ class _Planner:
                 *("chromeball", "envmap", "lights", self._env(), "--count", count),
                 *(option for path in depth for option in ("--depth", path)),
                 *("-o", output),
+            ),
+            {},
+        )
+
+    def _harmonics(self) -> StagePlan:
+        name = "envmap harmonics"
+        if not (self.scene.env.file or self.scene.probe):
+            return StagePlan(name, False, "no environment map")
+        if not self.scene.env.realtime:
+            return StagePlan(name, False, "nobody asks: env.realtime is false")
+        coefficients, irradiance = (
+            f"{self.build}/{file}" for file in ("harmonics.json", "irradiance.exr")
+        )
+        return StagePlan(
+            name,
+            True,
+            "diffuse light for real-time engines",
+            (self._env(),),
+            (coefficients, irradiance),
+            (
+                *("chromeball", "envmap", "harmonics", self._env()),
+                *("--map", irradiance, "-o", coefficients),
+            ),
+            {},
+        )
+
+    def _prefilter(self) -> StagePlan:
+        name = "envmap prefilter"
+        if not (self.scene.env.file or self.scene.probe):
+            return StagePlan(name, False, "no environment map")
+        if not self.scene.env.realtime:
+            return StagePlan(name, False, "nobody asks: env.realtime is false")
+        glossy = [thing.name for thing in self.scene.object if _glossy(thing)]
+        if not glossy:
+            return StagePlan(name, False, "no object is glossy")
+        cube, mips, table = (
+            f"{self.build}/{file}" for file in ("env.ktx2", "env_prefiltered.exr", "brdf.ktx2")
+        )
+        return StagePlan(
+            name,
+            True,
+            f"reflections of {', '.join(glossy)} in real-time engines",
+            (self._env(),),
+            (cube, mips, table),
+            (
+                *("chromeball", "envmap", "prefilter", self._env()),
+                *("--table", table, "-o", cube, "-o", mips),
             ),
             {},
         )
@@ -767,6 +854,13 @@ class _Planner:
                 "truth": self.scene.truth,
             },
         )
+
+
+def _glossy(thing: Object) -> bool:
+    """Whether an object mirrors anything; a mesh file's own materials may."""
+    if thing.material is None:
+        return Path(thing.mesh).suffix.lower() in (".glb", ".gltf", ".obj")
+    return thing.material.kind != "diffuse"
 
 
 def _check_probe(probe: Probe) -> None:

@@ -215,12 +215,33 @@ class Align(Table, frozen=True):
             raise ValueError("points, sun or north: one of them gives the heading")
 
 
+class Sun(Table, frozen=True):
+    """What gives back the light of a sun that every exposure clipped: `envmap sun`.
+
+    ``meter``: lux on a surface of ``normal`` ("up", "sun": it faced the sun, or a direction);
+    or ``ratio``: how much brighter a card is in the light than in the sun's shadow. ``at``:
+    the sun's direction where the map does not show it; ``radius`` of its disc, degrees;
+    ``accuracy`` of the reading, as a part of it; ``color`` of the sun's light.
+    """
+
+    meter: Positive | None = None
+    # msgspec 0.22: no bounded float beside a tuple
+    ratio: float | Vector | None = None
+    normal: Literal["up", "sun"] | Vector = "up"
+    at: Vector | None = None
+    clipped: Positive | None = None
+    color: Vector | None = None
+    radius: Annotated[float, Meta(ge=0.01, le=10)] = 0.2666
+    accuracy: Annotated[float, Meta(gt=0, lt=1)] = 0.05
+
+
 class Env(Table, frozen=True):
     """The lat-long map. ``file``: a finished panorama, so that nothing is stitched.
 
     ``lights``: how many light samples `envmap lights` writes. What no shot saw is completed
     from the plate of the view ``fill``, as matt ground of reflectance ``ground``, or from the
-    border of what was seen.
+    border of what was seen. ``realtime``: harmonics, irradiance and, where an object is
+    glossy, prefiltered maps for real-time engines.
     """
 
     width: Annotated[int, Meta(ge=16, le=32768)] = 1024
@@ -228,6 +249,8 @@ class Env(Table, frozen=True):
     lights: Annotated[int, Meta(ge=1, le=65536)] = 64
     ground: Vector | None = None
     fill: Name | None = None
+    sun: Sun | None = None
+    realtime: bool = False
 
 
 class StandIn(Table, frozen=True):

@@ -36,7 +36,12 @@ def changed(old: str, new: str, text: str = FULL) -> str:
 def test_full_scene_needs_all_but_the_pose_of_a_view_without_photograph(root: Path) -> None:
     plan = planned(FULL, root)
     skipped = {name: stage.reason for name, stage in plan.items() if not stage.needed}
-    assert skipped == {"calibrate pose wide": "no photograph behind the view"}
+    assert skipped == {
+        "calibrate pose wide": "no photograph behind the view",
+        "envmap sun": "no [env.sun]: the map is as it was seen",
+        "envmap harmonics": "nobody asks: env.realtime is false",
+        "envmap prefilter": "nobody asks: env.realtime is false",
+    }
 
 
 def test_commands_are_the_explicit_forms(root: Path) -> None:
@@ -82,6 +87,64 @@ def test_a_finished_panorama_is_turned_and_not_stitched(root: Path) -> None:
     assert plan["envmap probe"].command[-2:] == ("-o", "build/env.exr")
     assert "finished panorama" in plan["envmap probe"].reason
     assert "build/env.exr" in plan["render main"].inputs
+
+
+def test_a_restored_sun_stands_between_the_shots_and_everything_else(root: Path) -> None:
+    sun = '[env]\nsun = { ratio = [6, 5.5, 5], normal = "sun", radius = 0.3 }\n[probe]'
+    plan = planned(changed("[probe]", sun), root)
+    assert plan["envmap probe"].outputs == ("build/env_seen.exr",)
+    assert " ".join(plan["envmap sun"].command) == (
+        "chromeball envmap sun build/env_seen.exr --ratio 6,5.5,5 --normal sun --radius 0.3 "
+        "--accuracy 0.05 -o build/env.exr"
+    )
+    assert plan["render main"].inputs[0] == "build/env.exr"
+    both = changed("[probe]", "[env]\nsun = { ratio = 6, meter = 80000 }\n[probe]")
+    with pytest.raises(UserError, match="one of the two"):
+        planned(both, root)
+
+
+def test_no_prefiltering_without_glossy_objects(root: Path) -> None:
+    asked = changed("[probe]", "[env]\nrealtime = true\n[probe]")
+    plan = planned(asked, root)
+    assert plan["envmap harmonics"].outputs == ("build/harmonics.json", "build/irradiance.exr")
+    assert plan["envmap prefilter"].reason == "no object is glossy"
+    metal = asked.replace('kind = "diffuse"', 'kind = "mirror"')
+    plan = planned(metal, root)
+    assert plan["envmap prefilter"].needed
+    assert plan["envmap prefilter"].reason == "reflections of ball in real-time engines"
+    assert plan["envmap prefilter"].outputs[0] == "build/env.ktx2"
+
+
+def test_a_probe_of_balls_and_masks_in_full(root: Path) -> None:
+    text = changed(
+        'lens = { model = "equisolid", fov = 190 }\n', "trim = 1.5\nrefine = false\n"
+    )
+    text = changed(
+        '{ bracket = "front" }, { bracket = "back", yaw = -180 }',
+        '{ bracket = "front", ball = [300, 200, 90], mask = "m1.png" }, '
+        '{ bracket = "back", yaw = -90, ball = [310, 210, 91.5], mask = "m2.png" }',
+        text,
+    )
+    text = changed("[probe]", '[env]\nground = [0.2, 0.2, 0.1]\nfill = "main"\n[probe]', text)
+    plan = planned(text, root)["envmap probe"]
+    assert " ".join(plan.command) == (
+        "chromeball envmap probe build/front.exr build/back.exr --yaw 0,-90 "
+        "--ball 300,200,90 310,210,91.5 --photographer 20 --reflectance 1,1,1 --trim 1.5 "
+        "--mask m1.png m2.png --no-refine --ground 0.2,0.2,0.1 "
+        "--fill build/plate.exr:build/main.cameramodel --align build/align.json "
+        "--width 1024 -o build/env.exr"
+    )
+    assert {"m1.png", "m2.png", "build/plate.exr", "build/main.cameramodel"} <= set(plan.inputs)
+    for old, new, message in (
+        (", ball = [310, 210, 91.5]", "", "either all shots are of a ball"),
+        (', mask = "m2.png"', "", "either all shots have a mask"),
+        ("trim = 1.5", "refine_lens = true", "refine_lens solves"),
+        ("trim = 1.5", 'lens = { model = "equisolid", fov = 190 }', "but no lens"),
+        ('fill = "main"', 'fill = "mian"', "main"),
+        ('fill = "main"', 'fill = "wide"', "no photograph"),
+    ):
+        with pytest.raises(UserError, match=message):
+            planned(changed(old, new, text), root)
 
 
 def test_refined_times_reach_the_solver(root: Path) -> None:
@@ -475,7 +538,7 @@ def test_command_prints_states_and_reasons(
     (root / "scene.toml").write_text(FULL)
     run("plan", str(root / "scene.toml"))
     lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == 18
+    assert len(lines) == 21
     assert lines[0].startswith("take front           needed      2 exposures of visca:")
     assert any(line.startswith("calibrate pose wide  skipped") for line in lines)
     assert not list(root.glob("*.mk"))

@@ -136,21 +136,23 @@ def write_panorama(
     kept: dict[str, Any],
     origin: Any,
     completed: Any,
+    clipped: Any = None,
 ) -> None:
-    """A lat-long map with alpha, its attributes and its preview."""
+    """A lat-long map with alpha, marks (H, W), attributes and preview."""
     import numpy as np
 
     from chromeball.envmap.picture import latlong_attributes, tone_mapped, write_preview
     from chromeball.scene.image import write_exr
 
+    planes = {"completed": completed, **({} if clipped is None else {"clipped": clipped})}
     for name in ("origin", "worldToCamera"):
         kept.pop(name, None)
     stage.figures["preview"] = write_preview(output, "preview", tone_mapped(radiance, alpha))
     with stage.output(output) as temporary:
         write_exr(
             temporary,
-            np.dstack([radiance, alpha, completed]).astype(np.float32),
-            channels=("R", "G", "B", "A", "completed"),
+            np.dstack([radiance, alpha, *planes.values()]).astype(np.float32),
+            channels=("R", "G", "B", "A", *planes),
             attributes=latlong_attributes(kept, origin),
         )
 

@@ -384,7 +384,14 @@ def _probe(request: _Request, output: Path, as_json: bool) -> None:
         }
         kept = dict(pictures[files[0]].attributes)
         write_panorama(
-            stage, output, result.radiance, result.alpha, kept, origin, completed.astype(float)
+            stage,
+            output,
+            result.radiance,
+            result.alpha,
+            kept,
+            origin,
+            completed,
+            result.clipped,
         )
     if unseen > 0.01:
         print(
@@ -427,7 +434,7 @@ def _shot(request: _Request, k: int, image: Radiance) -> tuple[Shot, float | Non
     if not 0 <= request.photographer < 120:
         raise UserError(f"--photographer {request.photographer:g}: from 0 to 120 degrees")
     back = math.radians(request.photographer) if ball is not None else 0.0
-    shot = Shot(rgb, mapping, a, b, c, valid, back)
+    shot = Shot(rgb, mapping, a, b, c, valid, back, clipped)
     try:
         if request.vignetting:
             shot = without_vignetting(shot, request.vignetting)
@@ -489,6 +496,7 @@ def _turn_panorama(
     from chromeball.envmap.complete import Source, from_border
     from chromeball.envmap.mapping import LatLong, make_mapping
     from chromeball.envmap.picture import read_radiance
+    from chromeball.envmap.resample import carry
     from chromeball.envmap.resample import warp as resample
     from chromeball.scene.record import Stage
 
@@ -506,6 +514,9 @@ def _turn_panorama(
             source, origin = source.turned(pose.rotation), pose.translation
         target = LatLong((width, width // 2))
         result = resample(image.rgb, source, target, valid=image.valid)
+        clipped = None
+        if image.clipped is not None and image.clipped.any():
+            clipped = carry(image.clipped, source, target, valid=image.valid)
         completed = from_border(result.radiance, result.coverage == 0) * float(Source.BORDER)
         stage.figures |= {
             "size": target.size,
@@ -516,7 +527,9 @@ def _turn_panorama(
                 (target.solid_angles() * (1 - result.coverage)).sum()
             ),
         }
-        write_panorama(stage, output, result.radiance, result.coverage, kept, origin, completed)
+        write_panorama(
+            stage, output, result.radiance, result.coverage, kept, origin, completed, clipped
+        )
     print_figures(stage.figures, as_json, output)
 
 
