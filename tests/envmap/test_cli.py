@@ -411,6 +411,7 @@ def test_warp_reads_tiles_as_it_reads_rows(tmp_path: Path) -> None:
     spec = oiio.ImageSpec(300, 150, 3, "float")
     spec.tile_width = spec.tile_height = 64
     file = oiio.ImageOutput.create(str(tmp_path / "tiles.exr"))
+    assert file is not None
     assert file.open(str(tmp_path / "tiles.exr"), spec)
     assert file.write_image(rgb)
     assert file.close()
