@@ -48,8 +48,8 @@ def starts_of(camera: CameraModel, observations: Sequence[Observation]) -> list[
             raise UserError("a corner lies on or beyond the horizon of the others' plane")
         state = RectangleState.of(own, -d / (d @ own[:, 1])[:, None])
         for plane in _PLANES[rectangle.plane]:
-            turn = own @ plane.T
-            ups.append((turn[:, 1], turn, replace(state, plane=plane)))
+            placed = own @ plane.T
+            ups.append((placed[:, 1], placed, replace(state, plane=plane)))
     else:
         ups = [(u, None, None) for u in _likely_ups(camera, observations)]
     starts: list[State] = []
