@@ -3,6 +3,7 @@
 from cyclopts import App
 
 from chromeball.cli.envmap.align import align
+from chromeball.cli.envmap.check import check
 from chromeball.cli.envmap.export import export
 from chromeball.cli.envmap.harmonics import harmonics
 from chromeball.cli.envmap.lights import lights
@@ -10,8 +11,10 @@ from chromeball.cli.envmap.prefilter import prefilter
 from chromeball.cli.envmap.probe import probe
 from chromeball.cli.envmap.stitch import stitch
 from chromeball.cli.envmap.sun import sun
+from chromeball.cli.envmap.units import units
 from chromeball.cli.envmap.warp import warp
 
 app = App(name="envmap", help="The light around a point.")
-for _command in (warp, align, probe, stitch, sun, lights, harmonics, prefilter, export):
+_MAPS = (warp, align, probe, stitch, sun, units, check)
+for _command in (*_MAPS, lights, harmonics, prefilter, export):
     app.command(_command)

@@ -44,6 +44,8 @@ DEEDS = {
     "envmap lights": "The map as a few directional lights of the same total irradiance, and "
     "the harmonics of what they leave out.",
     "envmap harmonics": "Irradiance in spherical harmonics, with its error.",
+    "envmap units": "The map in cd/m^2, by light-meter readings.",
+    "envmap check": "A ball or chart rendered from the map beside the photographed one.",
     "envmap export": "The map turned as another program expects it.",
     "envmap prefilter": "The map blurred by the GGX lobe, for real-time engines.",
     "calibrate pose": "Where the photograph was taken from, by four points on the floor.",
