@@ -16,7 +16,7 @@ from chromeball.cli.envmap.arguments import (
 from chromeball.scene.errors import UserError
 
 if TYPE_CHECKING:
-    from chromeball.envmap.check import Patch
+    from chromeball.envmap.check import Chart, Comparison, Patch
 
 
 def check(
@@ -120,7 +120,7 @@ def check(
                 "light_off_degrees": math.degrees(found.light_off),
                 "picture": write_preview(output, "beside", to_display(side_by_side(found))),
             }
-            ratio, errors = found.ratio, found
+            errors: Comparison | Chart = found
         else:
             assert chart is not None
             towards = np.array(parse_numbers(normal, "--normal", 3))
@@ -129,9 +129,9 @@ def check(
             except UserError as error:
                 raise UserError(error.what, file=error.file or chart) from error
             stage.figures |= {"seen": flat.seen, "rendered": flat.rendered}
-            ratio, errors = flat.ratio, flat
+            errors = flat
         stage.figures |= {
-            "ratio": ratio,
+            "ratio": errors.ratio,
             "median_error": errors.median,
             "error_95": errors.worst,
             "median_error_without_ratio": errors.median_shape,
