@@ -27,6 +27,8 @@ class Source(IntEnum):
     BORDER = 1
     GROUND = 2
     PLATE = 3
+    NADIR = 4
+    PATCH = 5
 
 
 def from_plate(

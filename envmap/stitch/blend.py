@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chromeball.envmap.mapping import LatLong, Mapping, of_camera
-from chromeball.envmap.resample import warp
+from chromeball.envmap.resample import carry, warp
 from chromeball.envmap.stitch.frames import Frame
 from chromeball.envmap.stitch.photometric import Photometric
 from chromeball.envmap.stitch.seams import WIDTH, Seams, find_seams, sight
@@ -35,7 +35,8 @@ LIMITS = (0.5, 2.0)
 class Patch:
     """A frame in the lat-long, cropped: ``left`` may wrap around.
 
-    ``radiance`` (h, w, 3), ``coverage`` (h, w); ``energy_error``: what resampling changed.
+    ``radiance`` (h, w, 3), ``coverage`` (h, w); ``energy_error``: what resampling changed;
+    ``clipped`` (h, w) the share of lower bounds, None where there are none.
     """
 
     radiance: Picture
@@ -43,6 +44,7 @@ class Patch:
     top: int
     left: int
     energy_error: float
+    clipped: Picture | None = None
 
     def place(self, width: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Rows and columns of the map, for indexing."""
@@ -57,7 +59,9 @@ class Composite:
 
     ``labels`` (H, W) the frame of each pixel, -1 for none; ``energy_errors`` of each frame's
     resampling; ``limited`` pixels whose blend was held near the frames', ``limited_share`` what
-    that changed of the energy; ``blend_energy`` what the bands changed of it, relative.
+    that changed of the energy; ``blend_energy`` what the bands changed of it, relative;
+    ``clipped`` (H, W) the share of each pixel that is a lower bound in its frame, or None where
+    no frame says.
     """
 
     radiance: Picture
@@ -69,6 +73,7 @@ class Composite:
     limited: int
     limited_share: float
     blend_energy: float
+    clipped: Picture | None = None
 
 
 def compose(
@@ -139,6 +144,7 @@ def _blend(
     low = np.full((height, width, 3), np.inf, np.float32)
     high = np.zeros((height, width, 3), np.float32)
     chosen = ground.copy()
+    clipped = np.zeros_like(alpha) if any(p.clipped is not None for p in patches) else None
     for k, patch in enumerate(patches):
         at = patch.place(width)
         usable = patch.coverage > 0.5
@@ -149,6 +155,8 @@ def _blend(
         high[at] = np.where(sees, np.maximum(high[at], base), high[at])
         chosen[at] = np.where(mask[..., None], base, chosen[at])
         hot[at] += np.where(mask[..., None], patch.radiance - base, 0)
+        if clipped is not None and patch.clipped is not None:
+            clipped[at] = np.where(mask, patch.clipped, clipped[at])
         pyramid.add(np.where(sees, base - ground[at], 0), mask.astype(np.float32), patch)
     blended = ground + pyramid.collapse()
     bounded = np.clip(blended, LIMITS[0] * np.where(np.isfinite(low), low, 0), LIMITS[1] * high)
@@ -170,6 +178,7 @@ def _blend(
         limited=int((bounded != blended)[seen].any(axis=-1).sum()),
         limited_share=energy(bounded - np.where(seen[..., None], blended, 0)) / everything,
         blend_energy=energy(bounded) / max(energy(chosen), 1e-300) - 1,
+        clipped=clipped,
     )
 
 
@@ -255,7 +264,10 @@ def _patch(radiance: Picture, frame: Frame, source: Mapping, target: LatLong) ->
         left, across = int(seen[at + 1]) % width, width - int(gaps[at]) + 1
     top, bottom = int(rows[0]), int(rows[-1]) + 1
     where = np.ix_(np.arange(top, bottom), (left + np.arange(across)) % width)
-    return Patch(result.radiance[where], result.coverage[where], top, left, error)
+    clipped = None
+    if frame.clipped is not None and frame.clipped.any():
+        clipped = carry(frame.clipped, source, target, valid=frame.valid)[where]
+    return Patch(result.radiance[where], result.coverage[where], top, left, error, clipped)
 
 
 def _small(size: tuple[int, int]) -> tuple[int, int]:

@@ -7,6 +7,7 @@ from chromeball.cli.envmap.check import check
 from chromeball.cli.envmap.export import export
 from chromeball.cli.envmap.harmonics import harmonics
 from chromeball.cli.envmap.lights import lights
+from chromeball.cli.envmap.nadir import nadir
 from chromeball.cli.envmap.prefilter import prefilter
 from chromeball.cli.envmap.probe import probe
 from chromeball.cli.envmap.stitch import stitch
@@ -15,6 +16,6 @@ from chromeball.cli.envmap.units import units
 from chromeball.cli.envmap.warp import warp
 
 app = App(name="envmap", help="The light around a point.")
-_MAPS = (warp, align, probe, stitch, sun, units, check)
+_MAPS = (warp, align, probe, stitch, nadir, sun, units, check)
 for _command in (*_MAPS, lights, harmonics, prefilter, export):
     app.command(_command)
