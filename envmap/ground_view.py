@@ -9,12 +9,14 @@ shot's pixels with standard errors.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from chromeball.envmap.mapping import Lens, Mapping, of_camera
+from chromeball.envmap.mapping import Lens, Mapping, Radial
 from chromeball.envmap.stitch.features import find, match
 from chromeball.envmap.stitch.lens import pixel_focal
 from chromeball.scene.camera import CameraModel
@@ -96,7 +98,18 @@ def down_view(reach: float, density: float) -> CameraModel:
 
 def down_mapping(view: CameraModel) -> Mapping:
     """The view's mapping, turned to look down."""
-    return of_camera(view).turned(WORLD_FROM_DOWN)
+    f, _, cx, cy = (float(value) for value in view.intrinsics)
+    corner = math.atan(math.hypot(*view.size) / (2 * f))
+    # perspective as one more r(theta): in closed form, where an arbitrary lens needs tables
+    mapping = Radial(
+        view.size,
+        focal=(f, f),
+        centre=(cx, cy),
+        radius=np.tan,
+        angle=np.arctan,
+        max_angle=corner,
+    )
+    return mapping.turned(WORLD_FROM_DOWN)
 
 
 def place(
@@ -149,13 +162,14 @@ def place(
     found, mask = cv2.findHomography(
         flat, focal * tangent, cv2.USAC_MAGSAC, THRESHOLD, maxIters=20000, confidence=0.9999
     )
-    inside = np.zeros(len(q), bool) if found is None else np.asarray(mask).ravel() > 0
+    result: Any = found  # None where there is no consensus at all, whatever the stubs say
+    inside = np.zeros(len(q), bool) if result is None else np.asarray(mask).ravel() > 0
     if inside.sum() < max(LEAST, SHARE * len(q)):
         raise UserError(
             f"of {len(q)} features only {int(inside.sum())} agree on one plane: is it a shot "
             "of this ground, and flat? Four points can be clicked with --points"
         )
-    start = np.diag([1 / focal, 1 / focal, 1]) @ found @ WORLD_FROM_DOWN.T
+    start = np.diag([1 / focal, 1 / focal, 1]) @ result @ WORLD_FROM_DOWN.T
     # the sign that puts the features ahead of the camera
     start *= np.sign(np.median((world[inside] @ start.T)[:, 2]))
     return _refined(start, world[inside], q[inside] / scale, camera, edge, len(q), scale)
@@ -256,9 +270,8 @@ def _refined(
     )
 
 
-def _slopes(what: object, h: Array) -> Array:
+def _slopes(what: Callable[[Array], Array], h: Array) -> Array:
     """Central differences of pixels (N, 2) by the nine numbers, (2 N, 9)."""
-    assert callable(what)
     columns = [(what(h + step) - what(h - step)).ravel() / 2e-6 for step in 1e-6 * np.eye(9)]
     return np.nan_to_num(np.stack(columns, axis=1))
 

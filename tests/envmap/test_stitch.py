@@ -247,6 +247,27 @@ def test_exposures_that_agree_are_kept() -> None:
     assert result.seams.moved_solid_angle == 0
 
 
+def test_clipped_light_stays_marked() -> None:
+    """A lamp that every frame clips is marked where it is, once, in its size."""
+    lamp = np.array([math.sin(0.55), 0.1, math.cos(0.55)])
+    lamp /= np.linalg.norm(lamp)
+    mapping, reach = of_camera(LENS), math.radians(4)
+    frames = []
+    for k, (picture, turn) in enumerate(zip(pictures(), turns(), strict=True)):
+        on = mapping.turned(turn).directions() @ lamp > math.cos(reach)
+        lit = np.where(on[..., None], np.float32(20), picture)
+        frames.append(Frame(str(k), lit, clipped=on))
+    target = LatLong((512, 256))
+    result = compose(frames, LENS, turns(), 512, unchanged(7))
+    assert result.clipped is not None
+    solid, d = target.solid_angles(), target.directions()
+    marked = float((result.clipped * solid).sum())
+    assert marked == pytest.approx(2 * math.pi * (1 - math.cos(reach)), rel=0.1)
+    assert result.clipped[d @ lamp < math.cos(reach + 0.02)].max() == 0
+    plain = [Frame(str(k), p) for k, p in enumerate(pictures())]
+    assert compose(plain, LENS, turns(), 512, unchanged(7)).clipped is None
+
+
 def test_a_sun_is_one_sun_and_does_not_ring() -> None:
     sun = np.array([math.sin(0.55), 0.1, math.cos(0.55)])  # on a seam
     sun /= np.linalg.norm(sun)

@@ -304,7 +304,7 @@ def _lightmap(file: Path, image: Radiance) -> Lightmap:
 
 
 def _mask(path: Path, size: tuple[int, int], of: Path) -> Any:
-    from chromeball.cli.envmap.probe import read_mask
+    from chromeball.cli.envmap.arguments import read_mask
 
     return read_mask(path, size, of)
 

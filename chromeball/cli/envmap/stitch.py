@@ -301,7 +301,16 @@ def run(
         with stage.output(output.with_name(f"{output.stem}.directions.json")) as temporary:
             write_json(temporary, _directions(names, rotations, found))
         kept = dict(frames[0].attributes)
-        write_panorama(stage, output, result.radiance, result.alpha, kept, origin, completed)
+        write_panorama(
+            stage,
+            output,
+            result.radiance,
+            result.alpha,
+            kept,
+            origin,
+            completed,
+            result.clipped,
+        )
     print_figures(stage.figures, as_json, output)
 
 
