@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from bench.envmap_align import rows as align_rows
 from bench.envmap_lights import rows as lights_rows
 from bench.envmap_stitch import rows as stitch_rows
+from bench.envmap_update import rows as update_rows
 from bench.row import Row
 from chromeball.envmap.mapping import (
     LatLong,
@@ -51,7 +52,8 @@ def rows(quick: bool) -> list[Row]:
     result: list[Row] = []
     for what, source, target in tasks:
         result += _task(what, source, target)
-    return result + lights_rows(quick) + stitch_rows(quick) + align_rows(quick)
+    others = align_rows(quick) + update_rows(quick)
+    return result + lights_rows(quick) + stitch_rows(quick) + others
 
 
 def _task(what: str, source: Mapping, target: Mapping) -> list[Row]:

@@ -94,7 +94,46 @@ Place Captured::at(const Hit& hit, Vec3 d) const {
   return place;
 }
 
+void Captured::set_others(std::vector<OtherProbe> others) {
+  others_ = std::move(others);
+  if (others_.empty()) return;
+  if (stand_in_.size()) {
+    original_.add(stand_in_.original.data(), stand_in_.original.size() / 3,
+                  stand_in_.faces.data(), stand_in_.size());
+  }
+  original_.commit();
+}
+
+bool Captured::sees(Vec3 origin, const Place& place) const {
+  return !original_.occluded(origin, place.captured_at - origin, 1 - 1e-3f);
+}
+
 Vec3 Captured::radiance(const Place& place, Vec3 d) const {
+  if (!others_.empty()) {
+    const bool hidden = place ? !sees(origin_, place)
+                              : original_.occluded(origin_, d, kInfinity);
+    if (hidden) {
+      const OtherProbe* best = nullptr;
+      float finest = 0;
+      for (const OtherProbe& other : others_) {
+        if (!place) {
+          if (original_.occluded(other.origin, d, kInfinity)) continue;
+          best = &other;
+          break;
+        }
+        const Vec3 w = place.captured_at - other.origin;
+        // the side that d comes from; of a face that has moved since, either
+        const float cos = is_zero(place.p - place.captured_at)
+                              ? -dot(w, place.n) : std::abs(dot(w, place.n));
+        const float fine = cos / (length2(w) * length(w));  // solid angle of the surface
+        if (fine > finest && sees(other.origin, place)) best = &other, finest = fine;
+      }
+      if (best) {
+        return best->environment->radiance(
+            place ? normalize(place.captured_at - best->origin) : d);
+      }
+    }
+  }
   if (!place) return environment_.radiance(d);
   const Vec3 w = place.captured_at - origin_;
   return is_zero(w) ? Vec3() : environment_.radiance(normalize(w));  // the probe's own place

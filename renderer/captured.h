@@ -44,6 +44,12 @@ struct Place {
   Vec3 start() const { return p + rise * n; }
 };
 
+// A map taken elsewhere, for places that the first map does not see (seeds P21, F16).
+struct OtherProbe {
+  const Environment* environment;
+  Vec3 origin;
+};
+
 // A piece of the captured light: at a place in the set, or infinitely far in a direction.
 struct Lamp {
   Vec3 place;
@@ -78,6 +84,9 @@ struct Lamp {
 class Captured {
  public:
   Captured(const StandIn& stand_in, const Environment& environment, Vec3 origin, uint64_t seed);
+  // Before any light is asked for. Where the first map does not see a place, its radiance is
+  // that of the probe which shows it most finely; where none does, the first map's.
+  void set_others(std::vector<OtherProbe> others);
 
   Place trace(Vec3 o, Vec3 d, float tfar = kInfinity) const;
   Place at(const Hit& hit, Vec3 d) const;  // where that ray met the set
@@ -171,10 +180,14 @@ class Captured {
   // d omega_o / d omega_x through the surface element at q with normal n.
   float jacobian(Vec3 x, Vec3 q, Vec3 n) const;
 
+  bool sees(Vec3 origin, const Place& place) const;
+
   StandIn stand_in_;
   const Environment& environment_;
   Vec3 origin_;
   Accel accel_;
+  std::vector<OtherProbe> others_;
+  Accel original_;  // the set as it was when the maps were captured; built for others alone
   std::vector<Plane> planes_;
   std::vector<Light> lights_;
   std::optional<Peaks> peaks_;

@@ -57,6 +57,7 @@ class Compositor {
   // What support surfaces have beside their diffuse part: none, or a dielectric's gloss of this
   // reflectance at normal incidence (0..1) and roughness.
   void set_gloss(float reflectance, float roughness);
+  void set_others(std::vector<OtherProbe> others) { captured_.set_others(std::move(others)); }
 
   // The captured set alone through the camera, mean of `count` sub-samples: a plate.
   void background(const Camera& camera, uint32_t count, float* radiance) const;

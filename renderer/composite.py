@@ -50,6 +50,8 @@ class CapturedSet:
     ``environment`` (h, w, 3) float32 lat-long radiance, OpenEXR's axes in the world;
     ``origin`` (3,) the map's place in metres; ``stand_in`` triangles of the set. Without
     stand-in geometry all light is directional and there is nothing to cast shadows on.
+    ``others``: maps taken elsewhere, as (environment, origin) each; a place that the first map
+    does not see has the light of the one that shows it most finely.
 
     Raises
     ------
@@ -61,9 +63,12 @@ class CapturedSet:
     environment: NDArray[np.float32]
     origin: NDArray[np.float64]
     stand_in: StandInMesh | None = None
+    others: tuple[tuple[NDArray[np.float32], NDArray[np.float64]], ...] = ()
 
     def __post_init__(self) -> None:
         check_environment(self.environment)
+        for environment, _ in self.others:
+            check_environment(environment)
 
 
 @dataclass(frozen=True)
@@ -241,6 +246,10 @@ class Compositor:
             seed,
             samples,
         )
+        if captured.others:
+            self._others = [np.ascontiguousarray(e, np.float32) for e, _ in captured.others]
+            places = np.array([o - self._about for _, o in captured.others], np.float32)
+            self._core.set_others(self._others, places)
         if gloss is not None:
             self._core.set_gloss(gloss.reflectance, gloss.roughness)
         self._direct = None if integrator == "path" else core.Direct(self._core, seed)

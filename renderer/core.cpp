@@ -5,8 +5,11 @@
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/pair.h>
 #include <nanobind/stl/tuple.h>
+#include <nanobind/stl/vector.h>
 
 #include <tbb/parallel_for.h>
+
+#include <deque>
 
 #include "composite.h"
 #include "direct.h"
@@ -117,6 +120,17 @@ class CompositorArrays {
     compositor_->place(nb::cast<WorldArrays&>(objects).world);
     objects_ = std::move(objects);
   }
+  void set_others(const std::vector<Picture>& environments, In3f origins) {
+    if (environments.size() != origins.shape(0)) throw nb::value_error("an origin a map");
+    const nb::gil_scoped_release release;
+    std::vector<OtherProbe> probes;
+    for (size_t i = 0; i < environments.size(); ++i) {
+      const Picture& e = environments[i];
+      others_.emplace_back(e.data(), int(e.shape(0)), int(e.shape(1)));
+      probes.push_back({&others_.back(), Vec3(origins.data() + 3 * i)});
+    }
+    compositor_->set_others(std::move(probes));
+  }
   Compositor* operator->() { return &*compositor_; }
   const Compositor* operator->() const { return &*compositor_; }
   const Compositor& operator*() const { return *compositor_; }
@@ -125,6 +139,7 @@ class CompositorArrays {
   nb::object objects_;  // a WorldArrays
   StandInArrays stand_in_;
   std::optional<Environment> environment_;
+  std::deque<Environment> others_;
   std::optional<Compositor> compositor_;
 };
 
@@ -360,6 +375,8 @@ NB_MODULE(core, m) {
            nb::arg("environment"), nb::arg("origin"), nb::arg("bounces"), nb::arg("seed"),
            nb::arg("samples"))
       .def("place", &CompositorArrays::place, nb::arg("objects"))
+      .def("set_others", &CompositorArrays::set_others, nb::arg("environments"),
+           nb::arg("origins"))
       .def(
           "move",
           [](CompositorArrays& self, uint32_t object, Matrices matrices) {

@@ -165,8 +165,30 @@ def captured_set(scene: Scene, folder: Path) -> tuple[CapturedSet, list[Path]]:
     if environment.shape[1] != 2 * environment.shape[0]:
         raise UserError("a lat-long map is twice as wide as high", file=env_file)
     stand_in, inputs = _stand_in(scene, folder)
-    captured = CapturedSet(environment, _origin(env_file), stand_in)
-    return captured, [env_file, *inputs]
+    origin = _origin(env_file)
+    others = _others(scene, folder, origin)
+    if others and stand_in is None:
+        raise UserError("env.others: light from other places needs [[stand_in]] to lie on")
+    captured = CapturedSet(environment, origin, stand_in, others)
+    return captured, [env_file, *(folder / name for name in scene.env.others), *inputs]
+
+
+def _others(
+    scene: Scene, folder: Path, origin: NDArray[np.float64]
+) -> tuple[tuple[NDArray[np.float32], NDArray[np.float64]], ...]:
+    """The maps of other places; UserError where one is at the first one's or another's."""
+    found: list[tuple[NDArray[np.float32], NDArray[np.float64]]] = []
+    places = [origin]
+    for name in scene.env.others:
+        file = folder / name
+        environment, place = read_rgb(file), _origin(file)
+        if environment.shape[1] != 2 * environment.shape[0]:
+            raise UserError("a lat-long map is twice as wide as high", file=file)
+        if min(float(np.linalg.norm(place - p)) for p in places) < 1e-3:
+            raise UserError("two maps are of one place: leave one out", file=file)
+        places.append(place)
+        found.append((environment, place))
+    return tuple(found)
 
 
 def gloss_of(scene: Scene) -> Gloss | None:

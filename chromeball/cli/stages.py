@@ -802,7 +802,7 @@ class _Planner:
             yield replace(plan, command=(*plan.command[:-1], output, *more))
 
     def _picture(self, name: str, scene: Scene, view: View, picture: str) -> StagePlan:
-        inputs = [self._env()]
+        inputs = [self._env(), *scene.env.others]
         if scene.stand_in:
             inputs.append(f"{self.build}/stand_in.ply")
         if view.bracket or view.plate:

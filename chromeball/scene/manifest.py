@@ -241,12 +241,14 @@ class Env(Table, frozen=True):
     ``lights``: how many light samples `envmap lights` writes. What no shot saw is completed
     from the plate of the view ``fill``, as matt ground of reflectance ``ground``, or from the
     border of what was seen. ``realtime``: harmonics, irradiance and, where an object is
-    glossy, prefiltered maps for real-time engines.
+    glossy, prefiltered maps for real-time engines. ``others``: finished maps from other places,
+    with the attribute `origin`: what the first does not see has their light.
     """
 
     width: Annotated[int, Meta(ge=16, le=32768)] = 1024
     file: str | None = None
     lights: Annotated[int, Meta(ge=1, le=65536)] = 64
+    others: list[str] = []
     ground: Vector | None = None
     fill: Name | None = None
     sun: Sun | None = None
