@@ -68,8 +68,10 @@ def fit(blocks: Blocks, design: Array, prior: Array | None, spread: float) -> Fi
     if k == 1 and prior is None:  # where the iteration begins does matter: a crowd may walk by
         with np.errstate(divide="ignore", invalid="ignore"):
             s = np.nanmedian(np.where(a[..., 0] > 0, y.T / a[..., 0], np.nan), axis=1)[None]
+    elif prior is None:
+        s = _solve(a, y, np.ones(n), 0.0, centre)
     else:
-        s = _solve(a, y, np.ones(n), precision, centre)
+        s = np.tile(prior, (k, 1))
     scale, weight = 1.0, np.ones(n)
     for step in range(10):
         left = _length(y - (a @ s.T[..., None])[..., 0].T)
@@ -80,7 +82,8 @@ def fit(blocks: Blocks, design: Array, prior: Array | None, spread: float) -> Fi
             if step < 6
             else np.maximum(1 - (u / _TUKEY) ** 2, 0) ** 2
         )
-        s = _solve(a, y, weight, precision, centre)
+        # the prior is weighed against the noise that there is
+        s = _solve(a, y, weight, precision * scale**2, centre)
     covariance, resolution, condition = [], np.ones(k), 1.0
     for c in range(3):
         h = (a[c] * weight[:, None]).T @ a[c] / scale**2
