@@ -89,6 +89,7 @@ def test_a_full_scene_is_read_with_its_types() -> None:
     assert scene.probe.lens is not None
     assert scene.probe.lens.radius == 400.5
     assert scene.align is not None
+    assert scene.align.points is not None
     assert scene.align.points[3] == (7.0, 8.0)
     assert scene.stand_in[0].height_point == (669.0, 178.0)
     assert scene.object[0].scale == (1.0, 2.0, 3.0)
