@@ -159,27 +159,3 @@ def convention_of(name: str) -> Convention:
     if name not in CONVENTIONS:
         raise UserError(f"unknown program {name!r}; one of {', '.join(CONVENTIONS)}")
     return CONVENTIONS[name]
-
-
-#: Directions of the axis map and their colours, linear: each axis has its own.
-MARKS: tuple[tuple[tuple[int, int, int], tuple[float, float, float]], ...] = (
-    ((1, 0, 0), (1.0, 0.0, 0.0)),
-    ((-1, 0, 0), (0.0, 1.0, 1.0)),
-    ((0, 1, 0), (0.0, 1.0, 0.0)),
-    ((0, -1, 0), (1.0, 0.0, 1.0)),
-    ((0, 0, 1), (0.0, 0.0, 1.0)),
-    ((0, 0, -1), (1.0, 1.0, 0.0)),
-)
-
-
-def axis_map(width: int, radius: float = 0.35) -> NDArray[np.float32]:
-    """A lat-long map (width / 2, width, 3) with a disc of its own colour on each axis.
-
-    +X red, +Y green, +Z blue, the opposite axes in the opposite colours, `radius` radians
-    wide; between them grey. For trying a program's orientation.
-    """
-    d = LatLong((width, width // 2)).directions()
-    picture = np.full((*d.shape[:2], 3), 0.2, np.float32)
-    for axis, color in MARKS:
-        picture[d @ np.array(axis, float) > math.cos(radius)] = color
-    return picture

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from chromeball.scene.color import luminance
 from chromeball.scene.errors import UserError
-from chromeball.scene.image import linear_rows, to_display, write_picture
+from chromeball.scene.image import linear_rows, to_display, write_exr, write_picture
 
 #: What a map says about itself and is handed on, by OpenImageIO's names: `DateTime` is
 #: OpenEXR's capDate, `Copyright` its owner.
@@ -113,6 +113,40 @@ def read_latlong(path: str | os.PathLike[str]) -> Radiance:
     if width != 2 * height:
         raise UserError(f"{width}x{height} is no latlong map: it must be 2:1", file=path)
     return found
+
+
+def read_marks(path: str | os.PathLike[str]) -> dict[str, NDArray[np.float32]]:
+    """What a picture says beside its radiance, each channel (H, W): A, clipped, sigma.R, ...
+
+    Raises
+    ------
+    UserError
+        When the file is no linear picture.
+
+    """
+    with linear_rows(path) as (header, parts):
+        names = list(header.channels)
+        colours = {"R", "G", "B"} if "R" in names else {names[0]}
+        marks = {
+            name: np.empty(header.size[::-1], np.float32)
+            for name in names
+            if name not in colours
+        }
+        for first, pixels in parts:
+            for name, plane in marks.items():
+                plane[first : first + len(pixels)] = pixels[..., names.index(name)]
+    return marks
+
+
+def write_map(
+    path: str | os.PathLike[str],
+    radiance: NDArray[np.float32],
+    marks: Mapping[str, NDArray[Any]],
+    attributes: Mapping[str, Any],
+) -> None:
+    """Write a map (H, W, 3) and its `marks`, each (H, W) under its channel's name."""
+    pixels = np.dstack([radiance, *marks.values()])
+    write_exr(path, pixels, channels=("R", "G", "B", *marks), attributes=attributes)
 
 
 def latlong_attributes(

@@ -84,7 +84,7 @@ def predict(env: ProbeMap, camera: CameraModel, cast: Cast | None) -> tuple[Pict
     place = camera.world_from_camera.translation
     height, width = env.radiance.shape[:2]
     panorama = LatLong((width, height))
-    radiance, seen = env.radiance, None
+    radiance, seen = env.radiance, env.seen
     if cast is not None and np.linalg.norm(place - env.origin) > _HERE:
         moved = light_at([env], place, cast, width)
         radiance, seen = moved.radiance, moved.seen > 0.99

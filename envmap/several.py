@@ -40,10 +40,14 @@ _RAYS = 1 << 19
 
 @dataclass(frozen=True)
 class ProbeMap:
-    """A lat-long map ``radiance`` (H, W, 3) in the world's axes, taken at ``origin`` (3,)."""
+    """A lat-long map ``radiance`` (H, W, 3) in the world's axes, taken at ``origin`` (3,).
+
+    ``seen`` (H, W), where it was not completed; None for everywhere.
+    """
 
     radiance: Picture
     origin: Array
+    seen: NDArray[np.bool_] | None = None
 
 
 @dataclass(frozen=True)
@@ -162,7 +166,7 @@ def _weights(x: Array, d: Array, cast: Cast, sources: Sequence[_Source]) -> _Wei
         first, _ = cast(np.broadcast_to(o, d.shape), w)
         cosine = -(w * n).sum(axis=1)  # negative: the probe is behind the surface
         there = near & (cosine > 0) & (first > distance * (1 - _NEARER))
-        sees = np.where(met, there, np.isinf(first))
+        sees = np.where(met, there, np.isinf(first)) & source.sees(w)
         angle = np.arccos(np.clip((w * d).sum(axis=1), -1, 1))
         fine = cosine / np.where(near, distance, 1) ** 2  # solid angle of the surface
         apart = 1 / (float(np.sum((x - o) ** 2)) + _APART**2)
@@ -184,6 +188,14 @@ class _Source:
         bottom = np.roll(wide[-1:, 1:-1], width // 2, axis=1)
         caps = [np.pad(cap, ((0, 0), (1, 1), (0, 0)), mode="wrap") for cap in (top, bottom)]
         self.padded = np.concatenate([caps[0], wide, caps[1]])
+
+    def sees(self, d: Array) -> NDArray[np.bool_]:
+        """Whether the pixels that directions (N, 3) fall into were seen."""
+        if self.probe.seen is None:
+            return np.ones(len(d), bool)
+        width, height = self.mapping.size
+        x, y = np.rint(self.mapping.pixels_of(d)).astype(np.intp).T
+        return self.probe.seen[np.clip(y, 0, height - 1), x % width]
 
     def radiance(self, d: Array) -> Array:
         pixels = self.mapping.pixels_of(d) + 1

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 from typing import cast as cast_type
 
@@ -264,7 +264,7 @@ def _lamps(
         share = np.zeros((len(q), k, 3))
         for j in range(int(owner.max()) + 1):  # prediction is linear in the map
             alone = np.where((owner == j)[..., None], env.radiance, np.float32(0))
-            light, _ = predict(ProbeMap(alone, env.origin), c.frame.camera, cast)
+            light, _ = predict(replace(env, radiance=alone), c.frame.camera, cast)
             share[:, j] = c.means(light) / np.maximum(c.blocks.predicted, 1e-30)
         share = np.clip(share, 0, 1)
         lit = np.minimum(share.sum(axis=1), 1)

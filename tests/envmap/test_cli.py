@@ -81,7 +81,7 @@ def points_of(folder: Path) -> str:
 
 def check_panorama(path: Path) -> None:
     image = read_image(path)
-    assert image.channels == ("R", "G", "B", "A", "completed")
+    assert {"R", "G", "B", "A", "completed"} <= set(image.channels)
     truth = world(LatLong((128, 64)).directions())
     # the tilted zone between the two rims may be unseen
     seen = image.pixels[..., 3] > 0.99
@@ -181,6 +181,11 @@ def test_clipped_and_masked_pixels(tmp_path: Path) -> None:
     image = read_image(tmp_path / "env.exr")
     np.testing.assert_allclose(image.pixels[..., :3], 1, rtol=1e-5)
     assert "origin" not in image.attributes
+    # the map says where its light is a bound
+    alpha, marked = image.pixels[..., 3], image.pixels[..., image.channels.index("clipped")]
+    bound = float((LatLong((64, 32)).solid_angles() * alpha * marked).sum())
+    assert bound == pytest.approx(figures["clipped_solid_angle"][0], rel=0.02)
+    assert (marked > 0).mean() < 0.01
 
 
 def test_finished_panorama(tmp_path: Path) -> None:
@@ -192,7 +197,9 @@ def test_finished_panorama(tmp_path: Path) -> None:
     )
     camera = CameraModel.latlong((512, 256))
     source = LatLong((512, 256)).turned(pose.rotation)
-    write_exr(tmp_path / "theirs.exr", world(source.directions()))
+    lamp = (source.directions() @ np.array([0, 0.6, 0.8]) > math.cos(0.1)).astype(float)
+    theirs = np.dstack([world(source.directions()), lamp])
+    write_exr(tmp_path / "theirs.exr", theirs, channels=("R", "G", "B", "clipped"))
     x, z = np.array([-0.6, 0.6, 0.6, -0.6]), np.array([0.4, 0.4, -0.4, -0.4])
     clicks = camera.posed(pose).project_world(np.stack([x, np.zeros(4), z], axis=1))
     points = ", ".join(f"[{u:.4f}, {v:.4f}]" for u, v in clicks)
@@ -203,6 +210,13 @@ def test_finished_panorama(tmp_path: Path) -> None:
     run("envmap", "align", tmp_path / "scene.toml", "-o", tmp_path / "build/align.json")
     run("envmap", "probe", tmp_path / "scene.toml", "-o", tmp_path / "build/env.exr")
     check_panorama(tmp_path / "build/env.exr")
+    # what was too bright for their exposures is turned as well
+    made = read_image(tmp_path / "build/env.exr")
+    mapping = LatLong((128, 64))
+    marked = made.pixels[..., made.channels.index("clipped")] * mapping.solid_angles()
+    middle = np.einsum("hw,hwc->c", marked, mapping.directions())
+    np.testing.assert_allclose(middle / np.linalg.norm(middle), [0, 0.6, 0.8], atol=0.01)
+    assert marked.sum() == pytest.approx(2 * math.pi * (1 - math.cos(0.1)), rel=0.05)
 
 
 @pytest.mark.parametrize("kind", ["mirror", "angular", "cube", "latlong", "fisheye"])

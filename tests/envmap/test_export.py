@@ -19,7 +19,7 @@ import pytest
 from chromeball.cli.envmap import app
 from chromeball.envmap.companion import Dome, companion
 from chromeball.envmap.mapping import LatLong
-from chromeball.envmap.orientation import CONVENTIONS, MARKS, axis_map, oriented
+from chromeball.envmap.orientation import CONVENTIONS, oriented
 from chromeball.envmap.picture import latlong_attributes, map_from_world, read_latlong
 from chromeball.envmap.resample import warp
 from chromeball.scene.camera import WORLD_FROM_LATLONG, CameraModel
@@ -28,6 +28,29 @@ from chromeball.scene.image import read_image, write_exr
 from chromeball.scene.pose import Pose
 
 THREE = Path(__file__).resolve().parents[2] / "build/three"
+
+#: Axes of the test map and the colours of their discs.
+MARKS: tuple[tuple[tuple[int, int, int], tuple[float, float, float]], ...] = (
+    ((1, 0, 0), (1.0, 0.0, 0.0)),
+    ((-1, 0, 0), (0.0, 1.0, 1.0)),
+    ((0, 1, 0), (0.0, 1.0, 0.0)),
+    ((0, -1, 0), (1.0, 0.0, 1.0)),
+    ((0, 0, 1), (0.0, 0.0, 1.0)),
+    ((0, 0, -1), (1.0, 1.0, 0.0)),
+)
+
+
+def axis_map(width: int, radius: float = 0.35) -> np.ndarray:
+    """A lat-long map (width / 2, width, 3) with a disc of its own colour on each axis.
+
+    +X red, +Y green, +Z blue, the opposite axes in the opposite colours, `radius` radians
+    wide; between them grey. For trying a program's orientation.
+    """
+    d = LatLong((width, width // 2)).directions()
+    picture = np.full((*d.shape[:2], 3), 0.2, np.float32)
+    for axis, color in MARKS:
+        picture[d @ np.array(axis, float) > math.cos(radius)] = color
+    return picture
 
 
 def run(*arguments: object) -> None:

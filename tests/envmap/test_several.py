@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from chromeball.cli.envmap.geometry import nothing_near
 from chromeball.cli.main import build_app
+from chromeball.envmap.complete import Source
 from chromeball.envmap.mapping import LatLong
 from chromeball.envmap.several import LightAt, ProbeMap, fill, light_at
 from chromeball.scene.errors import UserError
@@ -68,6 +68,26 @@ def test_a_map_is_twice_there_no_brighter() -> None:
     )
     np.testing.assert_allclose(found.radiance, 2, rtol=1e-5)
     assert found.shares.sum() == pytest.approx(1 - found.unseen)
+
+
+def nothing_near(origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A set without geometry: no ray meets anything."""
+    return np.full(len(origins), np.inf), np.zeros_like(directions)
+
+
+def test_what_a_probe_completed_is_anothers_to_show() -> None:
+    """The near probe's completed half, a guess, comes from the far one that saw it."""
+    near, far = (np.full((16, 32, 3), v, np.float32) for v in (1.0, 3.0))
+    upper = np.zeros((16, 32), bool)
+    upper[:8] = True
+    probes = [ProbeMap(near, np.zeros(3), upper), ProbeMap(far, np.array([1e3, 0, 0]))]
+    found = light_at(probes, np.zeros(3), nothing_near, 32)
+    np.testing.assert_allclose(found.radiance[:7], 1, rtol=1e-5)
+    np.testing.assert_allclose(found.radiance[9:], 3, rtol=1e-5)
+    alone = light_at(probes[:1], np.zeros(3), nothing_near, 32)
+    assert alone.unseen == pytest.approx(0.5, abs=1e-6)
+    assert (alone.seen[9:] == 0).all()
+    assert (alone.probe[9:] == -1).all()
 
 
 def test_far_light_is_the_nearest_probes() -> None:
@@ -137,6 +157,10 @@ def test_command(tmp_path: Path) -> None:
     run("-1.6,1,-1.3", "--probes", tmp_path / "a.exr", tmp_path / "b.exr", *common)
     image = read_image(tmp_path / "at.exr")
     assert image.channels == ("R", "G", "B", "A", "completed", "probe")
+    alpha, completed, number = np.moveaxis(image.pixels[..., 3:], -1, 0)
+    assert ((alpha == 0) == (completed == Source.BORDER)).all()
+    assert ((alpha == 0) == (number == 0)).all()
+    assert (alpha > 0.99).mean() > 0.5
     np.testing.assert_allclose(np.ravel(image.attributes["origin"]), [-1.6, 1, -1.3], atol=1e-6)
     figures = read_json(tmp_path / "at.exr.record.json")["figures"]
     assert figures["shares_of_probes"][0] > 0.5

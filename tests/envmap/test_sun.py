@@ -166,8 +166,11 @@ def test_command(tmp_path: Path) -> None:
     truth = add_disc(sky(), SUN, SUN_RADIUS, LIGHT)
     map_, marked = clip(truth)
     env, out = tmp_path / "env.exr", tmp_path / "env_sun.exr"
-    pixels = np.concatenate([map_, marked[..., None]], axis=2)
-    channels = ("R", "G", "B", "clipped")
+    alpha = np.ones(marked.shape)
+    alpha[-1] = 0
+    marked[-2, 7] = True  # somewhere else
+    pixels = np.dstack([map_, alpha, marked, 2 * (1 - alpha)])
+    channels = ("R", "G", "B", "A", "clipped", "completed")
     write_exr(env, pixels, channels=channels)
     with pytest.raises(UserError, match="values are relative"):
         run("envmap", "sun", env, "--meter", 80000, "-o", out)
@@ -178,6 +181,10 @@ def test_command(tmp_path: Path) -> None:
     run("envmap", "sun", env, "--meter", reading, "--color", "90,80,65", "-o", out)
     made = read_image(out)
     assert "light meter" in made.attributes["sunRestored"]
+    assert made.channels == channels
+    np.testing.assert_array_equal(made.pixels[..., 3::2], np.dstack([alpha, 2 * (1 - alpha)]))
+    left = np.argwhere(made.pixels[..., 4] > 0)  # clipped is what is still a bound
+    assert left.tolist() == [[marked.shape[0] - 2, 7]]
     np.testing.assert_allclose(
         irradiance(made.pixels[..., :3], UP) @ LUMINANCE, reading, rtol=1e-3
     )

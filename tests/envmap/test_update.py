@@ -244,7 +244,12 @@ def test_the_fit_against_its_statistics() -> None:
 
 def test_command(tmp_path: Path) -> None:
     env = tmp_path / "env.exr"
-    write_exr(env, sky(), attributes={"origin": (0.0, 0.0, 0.0)})
+    alpha, clipped = np.ones(sky().shape[:2]), np.zeros(sky().shape[:2])
+    alpha[-1], clipped[3, 4] = 0, 1
+    marks = np.dstack([alpha, clipped, 2 * (1 - alpha), *np.moveaxis(0.01 * sky(), -1, 0)])
+    names = ("R", "G", "B", "A", "clipped", "completed", "sigma.R", "sigma.G", "sigma.B")
+    origin = {"origin": (0.0, 0.0, 0.0)}
+    write_exr(env, np.dstack([sky(), marks]), channels=names, attributes=origin)
     camera = looking(0.4)
     camera.write(tmp_path / "witness.cameramodel")
     picture, _ = predict(ProbeMap(sky(), np.zeros(3)), camera, None)
@@ -272,7 +277,10 @@ def test_command(tmp_path: Path) -> None:
     np.testing.assert_allclose(
         np.array(figures["energy"]) / figures["energy_before"], 0.6, rtol=1e-3
     )
-    np.testing.assert_allclose(read_image(out).pixels, 0.6 * sky(), rtol=2e-3)
+    now = read_image(out)
+    assert now.channels == names[:6]  # the noise is not that of the map any more
+    np.testing.assert_allclose(now.pixels[..., :3], 0.6 * sky(), rtol=2e-3)
+    np.testing.assert_array_equal(now.pixels[..., 3:], marks[..., :3].astype(np.float32))
     assert figures["warnings"] == []
     two = [tmp_path / "witness.cameramodel"] * 2
     with pytest.raises(UserError, match="2 cameras for 3 frames"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -128,6 +129,25 @@ def lens_of(
     return parse_lens(lens_text(lens), size)
 
 
+def clicked_shot(
+    names: Sequence[str], clicked: int | None, picture: str | None, aligned: Path
+) -> int:
+    """Index of the shot that was aligned: --clicked, else that of `picture`, else the first."""
+    if clicked is not None:
+        if not 1 <= clicked <= len(names):
+            raise UserError(f"--clicked {clicked}: there are {len(names)} shots")
+        return clicked - 1
+    if picture is None:
+        return 0
+    if picture in names:
+        return names.index(picture)
+    raise UserError(
+        f"aligned in {picture!r}, which is none of the shots {', '.join(names)}; "
+        "say which with --clicked",
+        file=aligned,
+    )
+
+
 def write_panorama(
     stage: Any,
     output: Path,
@@ -139,22 +159,21 @@ def write_panorama(
     clipped: Any = None,
 ) -> None:
     """A lat-long map with alpha, marks (H, W), attributes and preview."""
-    import numpy as np
+    from chromeball.envmap.picture import (
+        latlong_attributes,
+        tone_mapped,
+        write_map,
+        write_preview,
+    )
 
-    from chromeball.envmap.picture import latlong_attributes, tone_mapped, write_preview
-    from chromeball.scene.image import write_exr
-
-    planes = {"completed": completed, **({} if clipped is None else {"clipped": clipped})}
+    marks = {"A": alpha, "completed": completed}
+    if clipped is not None:
+        marks["clipped"] = clipped
     for name in ("origin", "worldToCamera"):
         kept.pop(name, None)
     stage.figures["preview"] = write_preview(output, "preview", tone_mapped(radiance, alpha))
     with stage.output(output) as temporary:
-        write_exr(
-            temporary,
-            np.dstack([radiance, alpha, *planes.values()]).astype(np.float32),
-            channels=("R", "G", "B", "A", *planes),
-            attributes=latlong_attributes(kept, origin),
-        )
+        write_map(temporary, radiance, marks, latlong_attributes(kept, origin))
 
 
 def print_figures(figures: dict[str, object], as_json: bool, output: Path) -> None:

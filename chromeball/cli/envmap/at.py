@@ -33,8 +33,9 @@ def at(
 ) -> None:
     """The map that a probe at a point would show, from probes at other places.
 
-    The maps are laid on the stand-in and looked at from the point. Channel `completed` is 1
-    where no probe saw what is seen from there, `probe` the number of the one that counts most.
+    The maps are laid on the stand-in and looked at from the point. What no probe saw of it is
+    completed from what is near it and has alpha 0; channel `probe` is the number of the probe
+    that counts most.
 
     Parameters
     ----------
@@ -55,14 +56,15 @@ def at(
     import numpy as np
 
     from chromeball.cli.envmap.geometry import caster, read_probe
+    from chromeball.envmap.complete import Source
     from chromeball.envmap.picture import (
         latlong_attributes,
         read_latlong,
         tone_mapped,
+        write_map,
         write_preview,
     )
     from chromeball.envmap.several import light_at
-    from chromeball.scene.image import write_exr
     from chromeball.scene.record import Stage, check_output
     from chromeball.stand_in.ply import read_stand_in
 
@@ -75,7 +77,6 @@ def at(
     check_panorama_width(across)
     with Stage("envmap at", [*probes, stand_in], point=point) as stage:
         found = light_at(maps, place, caster(read_stand_in(stand_in)), across)
-        completed = (found.seen < 0.5).astype(np.float32)
         stage.figures |= {
             "point": place,
             "metres_from_probes": [float(np.linalg.norm(p.origin - place)) for p in maps],
@@ -88,16 +89,13 @@ def at(
             "probes_preview": write_preview(output, "probes", _coloured(found.probe)),
         }
         attributes = latlong_attributes(dict(read_latlong(probes[0]).attributes), place)
-        pixels = np.dstack(
-            [found.radiance, np.ones_like(found.seen), completed, found.probe + 1]
-        )
+        marks = {
+            "A": found.seen,
+            "completed": np.where(found.seen == 0, Source.BORDER, Source.SEEN),
+            "probe": found.probe + 1,
+        }
         with stage.output(output) as temporary:
-            write_exr(
-                temporary,
-                pixels,
-                channels=("R", "G", "B", "A", "completed", "probe"),
-                attributes=attributes,
-            )
+            write_map(temporary, found.radiance, marks, attributes)
     print_figures(stage.figures, json, output)
 
 

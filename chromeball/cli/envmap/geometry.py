@@ -45,15 +45,6 @@ def caster(mesh: StandInMesh) -> Cast:
     return cast
 
 
-def nothing_near(
-    origins: NDArray[np.float64], directions: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """A set without geometry: no ray meets anything."""
-    import numpy as np
-
-    return np.full(len(origins), np.inf), np.zeros_like(directions)
-
-
 def read_probe(path: Path) -> ProbeMap:
     """A lat-long map with its attribute `origin`."""
     import numpy as np
@@ -70,4 +61,4 @@ def read_probe(path: Path) -> ProbeMap:
             "`envmap probe --align`",
             file=path,
         )
-    return ProbeMap(image.rgb, place)
+    return ProbeMap(image.rgb, place, image.valid)

@@ -238,7 +238,7 @@ def run(
         rotations, origin = found.rotations, None
         if align is not None:
             pose, picture = read_alignment(align)
-            index = _clicked(names, clicked, picture, align)
+            index = clicked_shot(names, clicked, picture, align)
             rotations = pose.rotation @ rotations[index].T @ rotations
             origin = pose.translation
         elif clicked is not None:
@@ -457,22 +457,6 @@ def _pictures(
         "check_difference": [check.difference for check in checks],
         "check_far": [check.far for check in checks],
     }
-
-
-def _clicked(names: Sequence[str], clicked: int | None, picture: str | None, file: Path) -> int:
-    if clicked is not None:
-        if not 1 <= clicked <= len(names):
-            raise UserError(f"--clicked {clicked}: there are {len(names)} frames")
-        return clicked - 1
-    if picture is None:
-        return 0
-    if picture in names:
-        return names.index(picture)
-    raise UserError(
-        f"aligned in {picture!r}, which is none of the frames {', '.join(names)}; say which "
-        "with --clicked",
-        file=file,
-    )
 
 
 def _say(text: str) -> None:

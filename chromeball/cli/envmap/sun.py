@@ -69,7 +69,9 @@ def sun(
     from chromeball.envmap.picture import (
         latlong_attributes,
         read_latlong,
+        read_marks,
         tone_mapped,
+        write_map,
         write_preview,
     )
     from chromeball.envmap.sun import (
@@ -78,7 +80,6 @@ def sun(
         restore_from_ratio,
         restore_from_reading,
     )
-    from chromeball.scene.image import write_exr
     from chromeball.scene.record import Stage
 
     if [meter, ratio, ball].count(None) != 2:
@@ -171,8 +172,11 @@ def sun(
             "sunIrradiance": made.sun.irradiance,
             "sunSigma": made.sigma,
         }
+        marks = read_marks(env)
+        if "clipped" in marks:  # no longer, where the sun is now known
+            marks["clipped"][(made.radiance != image.rgb).any(axis=2)] = 0
         with stage.output(output) as temporary:
-            write_exr(temporary, made.radiance, attributes=attributes)
+            write_map(temporary, made.radiance, marks, attributes)
     print_figures(stage.figures, json, output)
 
 

@@ -64,13 +64,14 @@ def update(
     from chromeball.envmap.picture import (
         latlong_attributes,
         read_latlong,
+        read_marks,
         tone_mapped,
+        write_map,
         write_preview,
     )
     from chromeball.envmap.predict import compare
     from chromeball.envmap.several import ProbeMap
     from chromeball.envmap.update import find_change, ratio_map, strange
-    from chromeball.scene.image import write_exr
     from chromeball.scene.record import Stage, check_output
 
     if not frames:
@@ -83,7 +84,7 @@ def update(
     check_output(output, inputs)
     image = read_latlong(env)
     place, cast = _place(image.attributes.get("origin"), env, stand_in)
-    old = ProbeMap(image.rgb, place)
+    old = ProbeMap(image.rgb, place, image.valid)
     shots = [
         _frame(frame, cameras[k] if len(cameras) > 1 else cameras[0])
         for k, frame in enumerate(frames)
@@ -148,18 +149,11 @@ def update(
         stage.figures["frame_preview"] = write_preview(
             output, "frame", _beside(moment[0], change)
         )
-        pixels = [radiance]
-        names = ["R", "G", "B"]
-        if image.valid is not None:
-            pixels.append(image.valid[..., None].astype(np.float32))
-            names.append("A")
+        marks = read_marks(env)
+        for channel in "RGB":  # the change has errors of its own that no pixel's sigma holds
+            marks.pop(f"sigma.{channel}", None)
         with stage.output(output) as temporary:
-            write_exr(
-                temporary,
-                np.concatenate(pixels, axis=2),
-                channels=names,
-                attributes=latlong_attributes(dict(image.attributes)),
-            )
+            write_map(temporary, radiance, marks, latlong_attributes(dict(image.attributes)))
     print_figures(stage.figures, json, output)
 
 
