@@ -12,6 +12,7 @@ from chromeball.cli.envmap.arguments import (
     Json,
     Out,
     check_panorama_width,
+    clicked_shot,
     parse_numbers,
     print_figures,
     read_camera,
