@@ -18,7 +18,8 @@ from chromeball.envmap.stitch.blend import compose
 from chromeball.envmap.stitch.features import find
 from chromeball.envmap.stitch.frames import Frame, read_frame
 from chromeball.envmap.stitch.lens import Freedom, full_frame, guessed
-from chromeball.envmap.stitch.orient import Prior, orient
+from chromeball.envmap.stitch.links import Prior
+from chromeball.envmap.stitch.orient import orient
 from chromeball.envmap.stitch.photometric import radius2, solve
 from chromeball.envmap.stitch.rotations import angle_between, exp
 from chromeball.scene.camera import WORLD_FROM_LATLONG

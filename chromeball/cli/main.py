@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import math
 import os
 import sys
 from typing import TYPE_CHECKING
@@ -36,14 +37,25 @@ SUMMARY = "Capture light, calibrate cameras and insert synthetic objects into re
 
 def build_app() -> App:
     """The root application, with every group lazy: only the module in use is imported."""
-    from cyclopts import App
+    from cyclopts import App, Parameter
 
-    app = App(name="chromeball", help=SUMMARY, help_format="plaintext")
+    app = App(
+        name="chromeball",
+        help=SUMMARY,
+        help_format="plaintext",
+        default_parameter=Parameter(validator=_finite),
+    )
     for name, (target, _) in COMMANDS.items():
         app.command(target, name=name)  # its docstring is its help
     for name, (module, summary) in GROUPS.items():
         app.command(f"{module}:app", name=name, help=summary)
     return app
+
+
+def _finite(_: object, value: object) -> None:
+    """No option of any command takes NaN or infinity."""
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ValueError("the number must be finite")
 
 
 def overview() -> str:

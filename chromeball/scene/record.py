@@ -72,20 +72,23 @@ def atomic_output(path: str | os.PathLike[str]) -> Generator[Path]:
 
 
 def check_output(
-    path: str | os.PathLike[str], inputs: Iterable[str | os.PathLike[str]] = ()
+    path: str | os.PathLike[str],
+    inputs: Iterable[str | os.PathLike[str]] = (),
+    suffix: str | None = None,
 ) -> None:
     """Refuse an output that cannot be written, before the work for it is done.
 
     Raises
     ------
     UserError
-        If `path` is a folder or one of the `inputs`, or its own folder cannot be made or
-        written.
+        If `path` is a folder or one of the `inputs`, does not end in `suffix`, or its own
+        folder cannot be made or written.
 
     """
     final = Path(path)
-    if final.exists() and any(os.path.samefile(final, i) for i in inputs if Path(i).exists()):
-        raise UserError("is an input, too; name another output", file=final)
+    if suffix is not None and final.suffix.lower() != suffix:
+        raise UserError(f"this is written as {suffix}: name it so", file=final)
+    _refuse_input(final, inputs)
     if final.is_dir():
         raise UserError("is a folder; name a file", file=final)
     try:
@@ -94,6 +97,12 @@ def check_output(
         raise UserError(f"cannot write here: {error.strerror}", file=final) from error
     if not os.access(final.parent, os.W_OK):
         raise UserError("cannot write here: permission denied", file=final)
+
+
+def _refuse_input(output: Path, inputs: Iterable[str | os.PathLike[str]]) -> None:
+    there = [path for path in inputs if Path(path).exists()]
+    if output.exists() and any(os.path.samefile(output, path) for path in there):
+        raise UserError("is an input, too; name another output", file=output)
 
 
 def _remove_leftovers(final: Path) -> None:
@@ -215,7 +224,11 @@ class Stage:
 
     @contextmanager
     def output(self, path: str | os.PathLike[str]) -> Generator[Path]:
-        """As :func:`atomic_output`; the output gets a record when the stage ends well."""
+        """As :func:`atomic_output`; the output gets a record when the stage ends well.
+
+        No stage overwrites what it was made from.
+        """
+        _refuse_input(Path(path), self.inputs)
         with atomic_output(path) as temporary:
             yield temporary
             # A run killed before its record is written must not leave an older run's figures.

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chromeball.envmap.probe import rotation
-from chromeball.envmap.stitch.orient import Prior
+from chromeball.envmap.stitch.links import Prior
 from chromeball.scene.camera import WORLD_FROM_LATLONG
 from chromeball.scene.errors import UserError
 from chromeball.scene.pose import Pose

@@ -54,6 +54,14 @@ def test_version() -> None:
             ["plan", "no/such/scene.toml"],
             "chromeball: no/such/scene.toml: no such scene file\n",
         ),
+        (
+            ["envmap", "sun", "env.exr", "--meter", "nan", "-o", "out.exr"],
+            'chromeball: Invalid value "nan" for --meter',
+        ),
+        (
+            ["envmap", "sun", "env.exr", "--meter", "5", "-o", "out.png"],
+            "chromeball: out.png: this is written as .exr",
+        ),
         (["bench", "hrd"], "chromeball: there is no stage 'hrd' to measure"),
     ],
 )

@@ -20,8 +20,15 @@ from chromeball.envmap.stitch.blend import compose
 from chromeball.envmap.stitch.directions import read_directions
 from chromeball.envmap.stitch.features import Features, find
 from chromeball.envmap.stitch.frames import Frame
-from chromeball.envmap.stitch.lens import Freedom, fov_of_frame, full_frame, parse_lens
-from chromeball.envmap.stitch.orient import Oriented, Prior, orient
+from chromeball.envmap.stitch.lens import (
+    Freedom,
+    fov_of_frame,
+    full_frame,
+    parse_lens,
+    pixel_focal,
+)
+from chromeball.envmap.stitch.links import Prior
+from chromeball.envmap.stitch.orient import Oriented, orient
 from chromeball.envmap.stitch.photometric import radius2, solve, unchanged
 from chromeball.envmap.stitch.rotations import Matches, adjust, angle_between, exp
 from chromeball.envmap.stitch.seams import find_seams
@@ -185,6 +192,11 @@ def test_frames_without_overlap() -> None:
     assert [list(g) for g in found.groups] == [[0, 1], [2]]
     assert any("placed by the tracker alone" in note for note in found.notes)
     assert angle_between(found.rotations[2], prior.rotations[3]) < math.radians(0.8)
+    # matches by chance say nothing of the lens
+    pair = Prior(prior.rotations[[0, 3]], prior.sigma[[0, 3]])
+    found = orient([few[0], few[2]], LENS, freedom=Freedom(focal=True), prior=pair)
+    assert not found.adjusted.inliers.any()
+    assert pixel_focal(found.camera) == pytest.approx(pixel_focal(LENS), rel=1e-6)
 
 
 def test_tiles_are_told_apart_by_the_tracker() -> None:

@@ -163,6 +163,21 @@ def test_every_output_of_a_stage_has_the_record_and_failures_have_none(tmp_path:
     assert not record_path(names[0]).exists()  # the old figures are not the new file's
 
 
+def test_no_stage_overwrites_what_it_was_made_from(tmp_path: Path) -> None:
+    source, link = tmp_path / "in.txt", tmp_path / "link.txt"
+    source.write_text("light")
+    link.symlink_to(source)
+    for output in (source, link):
+        with (
+            pytest.raises(UserError, match="is an input"),
+            Stage("test", [source]) as stage,
+            stage.output(output) as temporary,
+        ):
+            temporary.write_text("dark")
+    assert source.read_text() == "light"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["in.txt", "link.txt"]
+
+
 def test_hashes_follow_content_alone(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"same")
     (tmp_path / "b").write_bytes(b"same")

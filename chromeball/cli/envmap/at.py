@@ -71,7 +71,7 @@ def at(
     place = np.array(parse_numbers(point, "the point", 3))
     if not probes:
         raise UserError("--probes: at least one map is needed")
-    check_output(output, [*probes, stand_in])
+    check_output(output, [*probes, stand_in], ".exr")
     maps = [read_probe(path) for path in probes]
     across = maps[0].radiance.shape[1] if width is None else width
     check_panorama_width(across)

@@ -56,7 +56,7 @@ def daytime(
             raise UserError(f"{text}: say its hour, as {text}@09:00")
     hours = [parse_clock(when) for _, _, when in named]
     paths = [Path(name) for name, _, _ in named]
-    check_output(output, paths)
+    check_output(output, paths, ".exr")
     with Stage("envmap daytime", paths, at=at, blend=blend) as stage:
         images = [read_latlong(path) for path in paths]
         templates = [

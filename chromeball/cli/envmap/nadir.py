@@ -84,7 +84,7 @@ def nadir(
 
     from chromeball.envmap.nadir import find_hole, make_patch, with_patch
     from chromeball.envmap.picture import read_latlong
-    from chromeball.scene.record import Stage
+    from chromeball.scene.record import Stage, check_output
 
     if shot is None and patch is None:
         raise UserError("give a shot of the ground, or --patch fill or a picture")
@@ -97,6 +97,7 @@ def nadir(
     cone, area = _hole(hole)
     image_patch = Path(patch) if patch not in (None, "fill") else None
     inputs = [p for p in (env, shot, camera, mask, area, image_patch) if p is not None]
+    check_output(output, inputs, ".exr")
     with Stage("envmap nadir", inputs, exposure=exposure, feather=feather) as stage:
         image = read_latlong(env)
         _check_upright(image, env)

@@ -71,12 +71,13 @@ def make_map(request: Request, output: Path, as_json: bool) -> None:
     from chromeball.envmap.picture import read_radiance
     from chromeball.envmap.probe import combine, refined, trimmed, world_from_shots
     from chromeball.envmap.refine_lens import refine_lenses
-    from chromeball.scene.record import Stage
+    from chromeball.scene.record import Stage, check_output
 
     check_panorama_width(request.width)
     files, clicked = request.files, request.clicked
     if clicked is not None and request.align is None:
         raise UserError(f"--clicked {clicked} is for --align")
+    check_output(output, request.inputs, ".exr")
     settings = {"width": request.width, "vignetting": request.vignetting}
     with Stage("envmap probe", request.inputs, **settings) as stage:
         pictures = {file: read_radiance(file) for file in dict.fromkeys(files)}

@@ -80,7 +80,7 @@ def sun(
         restore_from_ratio,
         restore_from_reading,
     )
-    from chromeball.scene.record import Stage
+    from chromeball.scene.record import Stage, check_output
 
     if [meter, ratio, ball].count(None) != 2:
         raise UserError("give one of --meter, --ratio and --ball")
@@ -92,6 +92,8 @@ def sun(
         raise UserError("--color is for --meter and --ratio: a ball has its own colour")
     if not 0.01 <= radius <= 10 or not 0 < accuracy < 1:
         raise UserError("--radius is 0.01 to 10 degrees, --accuracy between 0 and 1")
+    inputs = [env, *(path for path in (ball, camera) if path)]
+    check_output(output, inputs, ".exr")
     image = read_latlong(env)
     level = float(image.attributes.get("whiteLuminance", 0) or 0)
     if meter is not None and level <= 0:
@@ -103,7 +105,6 @@ def sun(
     marked = image.clipped
     if clipped is not None:
         marked = (image.rgb.max(axis=2) >= clipped) | (False if marked is None else marked)
-    inputs = [env, *(path for path in (ball, camera) if path)]
     with Stage("envmap sun", inputs, meter=meter, ratio=ratio, normal=normal) as stage:
         found = find_sun(image.rgb, marked)
         if at is not None:

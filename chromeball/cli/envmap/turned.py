@@ -22,9 +22,10 @@ def turn_panorama(
     from chromeball.envmap.picture import read_radiance
     from chromeball.envmap.resample import carry
     from chromeball.envmap.resample import warp as resample
-    from chromeball.scene.record import Stage
+    from chromeball.scene.record import Stage, check_output
 
     check_panorama_width(width)
+    check_output(output, [file], ".exr")
     with Stage("envmap probe", [file, *([aligned] if aligned else [])], width=width) as stage:
         image = read_radiance(file)
         kept = dict(image.attributes)

@@ -75,7 +75,7 @@ def units(
         if [x, y, width, height] != place:
             raise UserError("--at: whole pixels x,y,width,height")
         readings.append(Spot(value, (x, y, width, height)))
-    check_output(output, [env])
+    check_output(output, [env], ".exr")
     image = read_latlong(env)
     with Stage("envmap units", [env], accuracy=accuracy) as stage:
         try:

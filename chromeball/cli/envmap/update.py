@@ -81,7 +81,7 @@ def update(
             f"{len(cameras)} cameras for {len(frames)} frames: give one camera, or one a frame"
         )
     inputs = [env, *frames, *dict.fromkeys(cameras), *([stand_in] if stand_in else [])]
-    check_output(output, inputs)
+    check_output(output, inputs, ".exr")
     image = read_latlong(env)
     place, cast = _place(image.attributes.get("origin"), env, stand_in)
     old = ProbeMap(image.rgb, place, image.valid)

@@ -102,7 +102,7 @@ def warp(
     )
     from chromeball.envmap.probe import rotation
     from chromeball.envmap.resample import Warping, marking
-    from chromeball.scene.record import Stage
+    from chromeball.scene.record import Stage, check_output
 
     angles = parse_numbers(rotate, "--rotate", 3) if rotate is not None else [0.0, 0.0, 0.0]
     if width is not None and not 1 <= width <= 65536:
@@ -111,6 +111,8 @@ def warp(
     optics.check(from_, to)
     inputs = [*files_of(picture, from_), *(path for path in (camera, mask) if path)]
     outputs = files_of(output, to)
+    for path in outputs:
+        check_output(path, inputs, ".exr")
     image = read_map(picture, from_)
     if mask is not None:
         allowed = read_mask(mask, image.size, picture)
