@@ -62,7 +62,12 @@ def find_sun(radiance: Picture, clipped: NDArray[np.bool_] | None = None) -> Sun
     y = radiance @ LUMINANCE.astype(np.float32)
     if not float(y.max()) > 0:
         return None
-    top, left = np.unravel_index(int(y.argmax()), y.shape)
+    # what was clipped was brighter than it looks
+    marks = clipped
+    if marks is not None and not (y[marks] > 0.3 * y.max()).any():
+        marks = None
+    peaks = y if marks is None else np.where(marks, y, -1)
+    top, left = np.unravel_index(int(peaks.argmax()), y.shape)
     d, solid = mapping.directions(), mapping.solid_angles()
     peak = d[top, left]
     near = d @ peak
@@ -71,10 +76,10 @@ def find_sun(radiance: Picture, clipped: NDArray[np.bool_] | None = None) -> Sun
     ring = (near < math.cos(1.25 * reach)) & (near > math.cos(2 * reach))
     background = np.median(radiance[ring], axis=0).astype(float)
     dim = float(background @ LUMINANCE)
-    at_limit = clipped is not None and bool(clipped[top, left])
-    above = 2.0 if at_limit else _ABOVE  # of a clipped one little is left
-    bright = y > 0.3 * y.max()
-    if float(y.max()) < above * max(dim, 1e-30) or (bright & ring).any():
+    # of a clipped one little is left
+    above = _ABOVE if marks is None else 1.0
+    bright = y > 0.3 * y.max() if marks is None else marks
+    if float(y[top, left]) < above * max(dim, 1e-30) or (bright & ring).any():
         return None  # dim, or part of something larger
     inside = near > math.cos(reach)
     excess = np.maximum(radiance[inside] - background, 0).astype(float)

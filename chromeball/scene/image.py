@@ -456,7 +456,9 @@ def write_hdr(path: str | os.PathLike[str], rgb: NDArray[np.float32]) -> None:
 
 def to_display(rgb: NDArray[Any], exposure: float = 1.0) -> NDArray[np.uint8]:
     """Scene-linear (H, W, 3) to 8-bit sRGB at `exposure`, for looking at (it clips)."""
-    codes = 255 * srgb_encode(np.clip(np.asarray(rgb, np.float32) * exposure, 0, 1)) + 0.5
+    with np.errstate(over="ignore"):  # what becomes infinite is white
+        light = np.clip(np.asarray(rgb, np.float32) * exposure, 0, 1)
+    codes = 255 * srgb_encode(light) + 0.5
     return codes.astype(np.uint8)
 
 

@@ -265,6 +265,9 @@ def parse_lens(
 
     model, _, rest = spec.partition(":")
     first, _, second = rest.partition(":")
+    named = ("pinhole", *(name for name in FISHEYE_MODELS if name != "kb4"))
+    if model not in named:
+        raise UserError(f"--lens {spec!r}: unknown lens {model!r}; one of {', '.join(named)}")
     try:
         if not rest:
             return guessed(model, size, focal35), True
@@ -273,8 +276,10 @@ def parse_lens(
             fov_of_frame(model, frame, focal)
             return full_frame(model, size, focal / frame * size[0]), False
         if model == "pinhole":
-            if second or not 0 < float(first) < 170:
+            if second:
                 raise ValueError
+            if not 0 < float(first) < 170:
+                raise UserError(f"--lens {spec!r}: a pinhole sees above 0, below 170 degrees")
             return CameraModel.pinhole(size, math.radians(float(first))), False
     except ValueError as error:
         raise UserError(

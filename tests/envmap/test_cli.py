@@ -369,6 +369,11 @@ def test_bad_probe_options(folder: Path) -> None:
 def test_lights_need_an_origin_for_positions(tmp_path: Path) -> None:
     write_exr(tmp_path / "env.exr", np.ones((8, 16, 3)))
     write_exr(tmp_path / "depth.exr", np.ones((8, 16, 1)), channels=("Z",))
+    with pytest.raises(UserError, match="--seed -1"):
+        run(
+            *("envmap", "lights", tmp_path / "env.exr", "--method", "random", "--seed=-1"),
+            *("-o", tmp_path / "l.json"),
+        )
     with pytest.raises(UserError, match="origin"):
         run(
             *("envmap", "lights", tmp_path / "env.exr", "--depth", tmp_path / "depth.exr"),

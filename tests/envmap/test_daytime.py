@@ -134,7 +134,7 @@ def test_refusals() -> None:
             parse_clock(text)
 
 
-def test_command(tmp_path: Path) -> None:
+def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     names = []
     for hour in (9, 12, 16):
         path = tmp_path / f"h{hour}.exr"
@@ -155,5 +155,11 @@ def test_command(tmp_path: Path) -> None:
     figures = read_json(tmp_path / "now.exr.record.json")["figures"]
     assert figures["between"] == ["12:00", "16:00"]
     assert figures["left_out_errors"]["12:00"] < 0.1
+    assert "warnings" not in figures
+    assert "warning" not in capsys.readouterr().err
+    # the same maps said to be of hours too near each other
+    hours = [name.split("@")[0] + f"@10:{k}0" for k, name in enumerate(names)]
+    run(*hours, "--at", "10:05", "-o", out)
+    assert "at most 15 an hour" in capsys.readouterr().err
     with pytest.raises(UserError, match="say its hour"):
         run(tmp_path / "h9.exr", "--at", "10:00", "-o", out)

@@ -473,6 +473,8 @@ def test_a_moving_camera_is_bent_to_meet() -> None:
         (["--sigma", "1"], "--sigma"),
         (["--lens", "pinhole:60", "--camera", "x.cameramodel"], "not both"),
         (["--yaw", "0,1,2"], "2 numbers"),
+        (["--lens", "foo:50"], "one of pinhole, equidistant"),
+        (["--lens", "pinhole:190"], "below 170"),
     ],
 )
 def test_mistakes(tmp_path: Path, options: list[str], message: str) -> None:

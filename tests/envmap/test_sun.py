@@ -162,7 +162,7 @@ def run(*arguments: object) -> None:
     build_app()([str(a) for a in arguments], result_action="return_value")
 
 
-def test_command(tmp_path: Path) -> None:
+def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     truth = add_disc(sky(), SUN, SUN_RADIUS, LIGHT)
     map_, marked = clip(truth)
     env, out = tmp_path / "env.exr", tmp_path / "env_sun.exr"
@@ -203,6 +203,27 @@ def test_command(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="--at"):
         run("envmap", "sun", env, "--ratio", 4, "-o", out)
     run("envmap", "sun", env, "--ratio", 4, "--at", "0.48,0.6,0.64", "-o", out)
+    figures = read_json(tmp_path / "env_sun.exr.record.json")["figures"]
+    assert figures["was_clipped"] is False
+    assert figures["sigma_direction_degrees"] is None
+    assert "warning" not in capsys.readouterr().err
+    # beside the sun that the map shows
+    write_exr(env, pixels, channels=channels)
+    run("envmap", "sun", env, "--ratio", 4, "--at", "-0.48,0.6,0.64", "-o", out)
+    assert "stands 57.4 degrees from --at" in capsys.readouterr().err
+
+
+def test_a_clipped_sun_little_brighter_than_the_sky_is_found() -> None:
+    truth = add_disc(sky(), SUN, SUN_RADIUS, LIGHT)
+    limit = 1.5 * float(sky().max())
+    marked = truth.max(axis=2) > limit
+    found = find_sun(np.minimum(truth, limit).astype(np.float32), marked)
+    assert found is not None
+    assert found.clipped
+    assert np.degrees(np.arccos(found.direction @ SUN / np.linalg.norm(SUN))) < 0.5
+    # a sky that was clipped is no sun
+    overcast = np.minimum(sky(), np.float32(3000))
+    assert find_sun(overcast, (sky() >= 3000).any(axis=2)) is None
 
 
 def test_command_with_a_ball(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 from chromeball.cli.envmap.arguments import (
     Json,
+    Numbers,
     Out,
     parse_numbers,
     print_figures,
@@ -29,7 +30,7 @@ def check(
     camera: Path | None = None,
     reflectance: str | None = None,
     chart: Path | None = None,
-    normal: str | None = None,
+    normal: Numbers = None,
     output: Out,
     json: Json = False,
 ) -> None:

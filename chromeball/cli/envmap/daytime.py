@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -10,6 +11,9 @@ from cyclopts import Parameter
 
 from chromeball.cli.envmap.arguments import Json, Out, print_figures
 from chromeball.scene.errors import UserError
+
+#: How fast the sun turns about the pole, and what hours and directions may be wrong by.
+DEGREES_AN_HOUR, SLACK = 15.0, 10.0
 
 
 def daytime(
@@ -81,6 +85,15 @@ def daytime(
             },
             "preview": write_preview(output, "preview", tone_mapped(made.radiance)),
         }  # fmt: skip
+        apart = made.later - made.earlier
+        if abs(made.turn) > math.radians(DEGREES_AN_HOUR * apart + SLACK):
+            warning = (
+                f"the sun turns by {math.degrees(abs(made.turn)):.0f} degrees in {apart:.1f} "
+                f"hours: it does at most {DEGREES_AN_HOUR:g} an hour; are these maps of one "
+                "place and day, their hours right, their axes the same?"
+            )
+            print(f"warning: {warning}", file=sys.stderr)
+            stage.figures["warnings"] = [warning]
         first = images[int(np.argmin(hours))]
         with stage.output(output) as temporary:
             write_exr(

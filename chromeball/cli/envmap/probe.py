@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from chromeball.cli.envmap.arguments import Json, Out, parse_numbers
+from chromeball.cli.envmap.arguments import Json, Numbers, Out, parse_numbers
 from chromeball.cli.envmap.probe_map import Request, make_map
 from chromeball.cli.envmap.turned import turn_panorama
 from chromeball.scene.errors import UserError
@@ -20,9 +20,9 @@ def probe(
     shots: list[Path],
     /,
     *,
-    yaw: str | None = None,
-    pitch: str | None = None,
-    roll: str | None = None,
+    yaw: Numbers = None,
+    pitch: Numbers = None,
+    roll: Numbers = None,
     lens: str | None = None,
     camera: Path | None = None,
     ball: str | None = None,
@@ -53,7 +53,8 @@ def probe(
         image circles is given once, with a lens for each.
     yaw
         Turn of each shot about the vertical, degrees, right-handed seen from above: "0,180".
-        Of a ball: where its camera looks.
+        Of a ball: where its camera looks; the middle of its picture shows what is behind that
+        camera (`envmap warp --from mirror` puts it ahead instead).
     pitch
         Tilt of each shot, degrees, up positive.
     roll
@@ -122,6 +123,10 @@ def probe(
         raise UserError("--refine-lens solves for what --lens says: give it")
     if lens is not None and (camera is not None or balls):
         raise UserError("--lens goes with neither --camera nor --ball")
+    if photographer is not None and not balls:
+        raise UserError("--photographer is for --ball")
+    if reflectance is not None and not balls:
+        raise UserError("--reflectance is for --ball")
     if lens is None and camera is None and not balls:
         raise UserError("give --lens, --camera or --ball")
     if len(shots) == 1:

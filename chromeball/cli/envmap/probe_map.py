@@ -81,6 +81,8 @@ def make_map(request: Request, output: Path, as_json: bool) -> None:
     settings = {"width": request.width, "vignetting": request.vignetting}
     with Stage("envmap probe", request.inputs, **settings) as stage:
         pictures = {file: read_radiance(file) for file in dict.fromkeys(files)}
+        for note in _guessed_circles(request, pictures):
+            print(f"note: {note}", file=sys.stderr)
         shots: list[Shot] = []
         clipped: list[float] = []
         for k, file in enumerate(files):
@@ -212,6 +214,20 @@ def _shot(request: Request, k: int, image: Radiance) -> tuple[Shot, float | None
         raise UserError(error.what, file=file) from error
     bound = None if clipped is None else float(shot.mapping.solid_angles()[clipped].sum())
     return shot, bound
+
+
+def _guessed_circles(request: Request, pictures: dict[Path, Radiance]) -> list[str]:
+    """Where a lens's circle was not given, and the picture's shape does not tell it."""
+    notes: list[str] = []
+    for file, lens in dict(zip(request.files, request.lenses, strict=True)).items():
+        width, height = pictures[file].size
+        if isinstance(lens, str) and lens.count(":") < 2 and width != height:
+            notes.append(
+                f"{file.name}: the lens's circle is taken to be {min(width, height)} px wide, "
+                "as the picture's short side; if the picture cuts it off, give "
+                "--lens MODEL:FOV:cx,cy,radius"
+            )
+    return notes
 
 
 def _lens_option(spec: str | Path | None, shot: Shot) -> str:

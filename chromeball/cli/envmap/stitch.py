@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from chromeball.cli.envmap.arguments import (
     Json,
+    Numbers,
     Out,
     parse_numbers,
 )
@@ -25,9 +26,9 @@ def stitch(
     lens: str | None = None,
     refine: Refine | None = None,
     directions: Path | None = None,
-    yaw: str | None = None,
-    pitch: str | None = None,
-    roll: str | None = None,
+    yaw: Numbers = None,
+    pitch: Numbers = None,
+    roll: Numbers = None,
     sigma: float | None = None,
     align: Path | None = None,
     clicked: int | None = None,
@@ -88,6 +89,7 @@ def stitch(
 
     """
     from chromeball.envmap.stitch.directions import SESSION, from_angles, read_directions
+    from chromeball.envmap.stitch.lens import parse_lens
 
     if len(frames) == 1 and frames[0].suffix == ".toml":
         given = (camera, lens, refine, directions, yaw, pitch, roll, sigma, align, clicked)
@@ -98,6 +100,8 @@ def stitch(
     count = len(frames)
     if camera is not None and lens is not None:
         raise UserError("give --lens or --camera, not both")
+    if lens is not None:
+        parse_lens(lens, (640, 480))  # what cannot be is said before the frames are read
     angles = [yaw, pitch, roll]
     if directions is not None and any(a is not None for a in angles):
         raise UserError("give --directions or --yaw, --pitch and --roll, not both")

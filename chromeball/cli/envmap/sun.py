@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
+import sys
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from chromeball.cli.envmap.arguments import Json, Out, parse_numbers, print_figures
+from cyclopts import Parameter
+
+from chromeball.cli.envmap.arguments import Json, Numbers, Out, parse_numbers, print_figures
 from chromeball.scene.errors import UserError
 
 
@@ -19,8 +22,8 @@ def sun(
     ball: Path | None = None,
     circle: str | None = None,
     camera: Path | None = None,
-    normal: str = "up",
-    at: str | None = None,
+    normal: Annotated[str, Parameter(allow_leading_hyphen=True)] = "up",
+    at: Numbers = None,
     clipped: float | None = None,
     color: str | None = None,
     radius: float = 0.2666,
@@ -49,7 +52,7 @@ def sun(
     normal
         Of the measured surface: up, sun (it faced the sun) or x,y,z.
     at
-        The sun's direction x,y,z, where the map does not show it.
+        The sun's direction x,y,z, where the map does not show it; it is taken as exact.
     clipped
         Values from here on are clipped, where the map has no channel that says so.
     color
@@ -113,9 +116,20 @@ def sun(
             towards = np.array(parse_numbers(at, "--at", 3))
             if not towards.any():
                 raise UserError("--at 0,0,0: a direction is needed")
+            towards /= np.linalg.norm(towards)
+            off = (
+                0.0 if found is None else math.acos(min(float(towards @ found.direction), 1.0))
+            )
+            if found is not None and off > math.radians(1) + found.angular_radius:
+                print(
+                    f"warning: the map's own sun stands {math.degrees(off):.1f} degrees from "
+                    "--at and stays where it is: leave out --at, or turn the map",
+                    file=sys.stderr,
+                )
             colour = np.array(image.rgb.reshape(-1, 3).mean(axis=0), float)
-            found = Sun(towards / np.linalg.norm(towards), 0.0, math.radians(radius), 0.0,
-                        1e-9 * colour, colour, True)  # fmt: skip
+            bound = marked is not None and bool(_about(marked, towards, radius).any())
+            found = Sun(towards, math.nan, math.radians(radius), 0.0,
+                        1e-9 * colour, colour, bound)  # fmt: skip
         if found is None:
             raise UserError(
                 "no small bright light: say where the sun stands with --at x,y,z", file=env
@@ -179,6 +193,16 @@ def sun(
         with stage.output(output) as temporary:
             write_map(temporary, made.radiance, marks, attributes)
     print_figures(stage.figures, json, output)
+
+
+def _about(marked: Any, direction: Any, radius: float) -> Any:
+    """The marks (N,) of the pixels within `radius` degrees, or the nearest one."""
+    import numpy as np
+
+    from chromeball.envmap.mapping import LatLong
+
+    near = LatLong(marked.shape[::-1]).directions() @ direction
+    return marked[near >= min(math.cos(math.radians(radius)), float(np.max(near)))]
 
 
 def _ball(ball: Path, circle: str, camera: Path) -> tuple[Any, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from chromeball.cli.envmap.arguments import Json, Out, parse_numbers, print_figures
+from chromeball.cli.envmap.arguments import Json, Numbers, Out, parse_numbers, print_figures
 from chromeball.scene.errors import UserError
 
 
@@ -14,9 +14,9 @@ def units(
     /,
     *,
     lux: str | None = None,
-    normal: str | None = None,
+    normal: Numbers = None,
     luminance: str | None = None,
-    at: str | None = None,
+    at: Numbers = None,
     accuracy: float = 0.05,
     output: Out,
     json: Json = False,

@@ -14,6 +14,7 @@ from cyclopts import Parameter
 
 from chromeball.cli.envmap.arguments import (
     Json,
+    Numbers,
     Out,
     parse_numbers,
     print_figures,
@@ -43,7 +44,7 @@ def warp(
     to_lens: str | None = None,
     ball_distance: float | None = None,
     focal: float | None = None,
-    rotate: str | None = None,
+    rotate: Numbers = None,
     mask: Path | None = None,
     fast: Annotated[bool, Parameter(negative="")] = False,
     output: Out,
@@ -53,9 +54,9 @@ def warp(
 
     A cube is a cross, 4:3 (cube) or 3:4 (cube-vertical), a row (cube-strip) or column
     (cube-column) of px nx py ny pz nz, or six files of these names (cube-files, {} in their
-    place: "pisa_{}.hdr"). A mirror ball is a photograph of one, cropped to it. Where the source
-    does not see, the result is black with alpha 0. Channels sigma.R, sigma.G, sigma.B and
-    clipped are carried along.
+    place: "pisa_{}.hdr"). A mirror ball is a photograph of one, cropped to it; its middle, that
+    shows the camera, is ahead (+Z). Where the source does not see, the result is black with
+    alpha 0. Channels sigma.R, sigma.G, sigma.B and clipped are carried along.
 
     Parameters
     ----------
