@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from bench.envmap_align import rows as align_rows
 from bench.envmap_lights import rows as lights_rows
+from bench.envmap_probe import rows as probe_rows
 from bench.envmap_stitch import rows as stitch_rows
 from bench.envmap_update import rows as update_rows
 from bench.row import Row
@@ -52,7 +53,7 @@ def rows(quick: bool) -> list[Row]:
     result: list[Row] = []
     for what, source, target in tasks:
         result += _task(what, source, target)
-    others = align_rows(quick) + update_rows(quick)
+    others = align_rows(quick) + update_rows(quick) + probe_rows(quick)
     return result + lights_rows(quick) + stitch_rows(quick) + others
 
 

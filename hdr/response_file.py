@@ -15,6 +15,7 @@ from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
 from chromeball.hdr.knots import DEPTHS
+from chromeball.hdr.rsp import parse_rsp
 from chromeball.scene.errors import UserError
 from chromeball.scene.record import decode, to_json
 
@@ -101,7 +102,7 @@ def encode_response(response: Response) -> bytes:
 
 
 def read_response(path: str | os.PathLike[str]) -> Response:
-    """Read and check a ``response.json``.
+    """Read and check a ``response.json``, or a ``.rsp`` of Radiance's hdrgen.
 
     Raises
     ------
@@ -111,11 +112,14 @@ def read_response(path: str | os.PathLike[str]) -> Response:
 
     """
     try:
-        return parse_response(Path(path).read_bytes(), path)
+        data = Path(path).read_bytes()
     except FileNotFoundError as error:
         raise UserError("no such response; `hdr response` makes one", file=path) from error
     except OSError as error:
         raise UserError(f"cannot be read: {error.strerror}", file=path) from error
+    if Path(path).suffix.lower() == ".rsp":
+        return Response.from_log_exposure(parse_rsp(data.decode(errors="replace"), path))
+    return parse_response(data, path)
 
 
 def parse_response(data: bytes, path: str | os.PathLike[str] = "response.json") -> Response:

@@ -261,7 +261,8 @@ def merge(
         ),
     ] = False,
     response: Annotated[
-        Path | None, Parameter(help="response.json of the camera; needed unless linear.")
+        Path | None,
+        Parameter(help="response.json of the camera, or .rsp; needed unless linear."),
     ] = None,
     sigma: Annotated[
         bool, Parameter(negative="", help="Add channels with standard errors.")

@@ -305,6 +305,7 @@ def test_bad_maps(
         (["--to", "mirror", "--width", "10", "--rotate", "1,2"], "3 numbers"),
         (["--to", "mirror", "--width", "10", "--rotate", "1,2,inf"], "finite"),
         (["--to", "mirror", "--width", "10", "--to-lens", "equisolid:180"], "--to-lens"),
+        (["--to", "mirror", "--width", "10", "--vignetting", "0.1"], "--from fisheye"),
     ],
 )
 def test_bad_warp_options(tmp_path: Path, arguments: list[str], message: str) -> None:
@@ -400,6 +401,18 @@ def test_one_line_and_exit_code(tmp_path: Path) -> None:
     assert done.returncode == 2
     assert done.stderr.strip() == "chromeball: none.exr: no such picture"
     assert not list(tmp_path.iterdir())
+
+
+def test_warp_divides_by_the_vignetting(tmp_path: Path) -> None:
+    y, x = np.mgrid[:SIZE, :SIZE] - (SIZE - 1) / 2
+    r2 = (x**2 + y**2) / (SIZE / 2) ** 2
+    dim = np.maximum(1 - 0.4 * r2 + 0.1 * r2**2, 0.1)
+    write_exr(tmp_path / "dim.exr", np.repeat(dim[..., None], 3, 2).astype(np.float32))
+    lens = ("--from", "fisheye", "--lens", "equisolid:190", "--to", "latlong")
+    options = (*lens, "--vignetting=-0.4,0.1", "--width", "256", "-o", tmp_path / "even.exr")
+    run("envmap", "warp", tmp_path / "dim.exr", *options)
+    even = read_image(tmp_path / "even.exr").pixels
+    np.testing.assert_allclose(even[..., :3][even[..., 3] == 1], 1, atol=2e-3)
 
 
 def test_warp_leaves_out_what_a_mask_does(tmp_path: Path) -> None:

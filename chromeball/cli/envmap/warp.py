@@ -42,6 +42,7 @@ def warp(
     camera: Path | None = None,
     lens: str | None = None,
     to_lens: str | None = None,
+    vignetting: str | None = None,
     ball_distance: float | None = None,
     focal: float | None = None,
     rotate: Numbers = None,
@@ -75,6 +76,9 @@ def warp(
         The fisheye, as MODEL:FOV[:cx,cy,radius], degrees and pixels.
     to_lens
         The fisheye that is made, where both maps are fisheyes.
+    vignetting
+        Fall-off c1,c2,... of 1 + c1 r^2 + c2 r^4 + ... of the fisheye that is read, r = 1 at
+        the rim of its circle.
     ball_distance
         From the camera to the mirror ball's centre, in ball radii; without it the ball is far.
     focal
@@ -101,7 +105,7 @@ def warp(
         map_from_world,
         write_preview,
     )
-    from chromeball.envmap.probe import rotation
+    from chromeball.envmap.probe import rotation, vignetting_gain
     from chromeball.envmap.resample import Warping, marking
     from chromeball.scene.record import Stage, check_output
 
@@ -110,6 +114,9 @@ def warp(
         raise UserError(f"--width {width}: it must be from 1 to 65536")
     optics = Optics(lens, to_lens, camera, ball_distance, focal)
     optics.check(from_, to)
+    if vignetting is not None and from_ != "fisheye":
+        raise UserError("--vignetting is of a fisheye that is read: --from fisheye")
+    falloff = parse_numbers(vignetting, "--vignetting", None) if vignetting is not None else []
     inputs = [*files_of(picture, from_), *(path for path in (camera, mask) if path)]
     outputs = files_of(output, to)
     for path in outputs:
@@ -128,8 +135,15 @@ def warp(
     else:
         source = source_map(from_, image.size, optics, picture)
         target = target_map(to, width, optics, source)
+    if falloff:
+        gain = vignetting_gain(source, falloff).astype(np.float32)[..., None]
+        image = replace(
+            image,
+            rgb=image.rgb * gain,
+            sigma=None if image.sigma is None else image.sigma * gain,
+        )
     turn = rotation(*(math.radians(a) for a in angles))
-    with Stage("envmap warp", inputs, to=to, fast=fast) as stage:
+    with Stage("envmap warp", inputs, to=to, fast=fast, vignetting=falloff) as stage:
         job = Warping(
             image.rgb,
             source,
