@@ -182,7 +182,8 @@ def merged(bracket: Bracket) -> Picture:
     names = [Path(str(j)) for j in range(len(bracket.frames))]
     response = from_solution(found, ("R", "G", "B"), names, bracket.exposures, {})
     exposures = np.exp(found.log_exposures)
-    shown = [frame[lattice(bracket.size[::-1])].reshape(-1, 3) for frame in bracket.frames]
+    width, height = bracket.size
+    shown = [frame[lattice((height, width))].reshape(-1, 3) for frame in bracket.frames]
     tables = code_weights(response, measure_codes(shown, exposures, response))
     return merge_frames(bracket.frames, exposures, response, tables=tables).radiance
 
