@@ -99,9 +99,7 @@ def compose(
         if progress is not None:
             progress(f"resampling {frame.name}")
         source = of_camera(camera).turned(rotations[k]) if mappings is None else mappings[k]
-        radiance = frame.radiance
-        if photometric.applied:
-            radiance = radiance * photometric.gain(k, camera)
+        radiance = photometric.corrected(frame, k, camera)
         patches.append(_patch(radiance, frame, source, target))
         clips.append(_clipped(frame, of_camera(camera).turned(rotations[k]), small))
     low = np.stack([_reduced(p, p.radiance, width, small.size) for p in patches])

@@ -29,7 +29,8 @@ class Frame:
 
     ``radiance`` (H, W, 3) float32; ``valid`` (H, W) or None for all; ``clipped`` (H, W) or
     None: lower bounds. ``source`` says how it became linear; ``focal35`` the focal length as
-    it would be on 36 x 24 mm, from the metadata, or None.
+    it would be on 36 x 24 mm, from the metadata, or None. ``gathered``: exposure that was
+    divided out; of a photograph ``radiance * gathered`` is what its codes say, from 0 to 1.
     """
 
     name: str
@@ -39,6 +40,12 @@ class Frame:
     source: str = "radiance"
     focal35: float | None = None
     attributes: dict[str, Any] = field(default_factory=dict[str, Any])
+    gathered: float = 1.0
+
+    @property
+    def assumed(self) -> bool:
+        """Whether the camera's curve is a guess."""
+        return self.source.startswith("sRGB")
 
     @property
     def size(self) -> tuple[int, int]:
@@ -99,6 +106,7 @@ def read_frame(path: str | os.PathLike[str], response: Response | None = None) -
         (codes >= SATURATED * depth).any(axis=2),
         source,
         focal,
+        gathered=1.0 if gathered is None else gathered,
     )
 
 

@@ -1,13 +1,18 @@
 """Exposure of each frame and the lens's fall-off, from where frames overlap (seeds.md F1s).
 
 ln L_i(p) = ln L(p) + e_i + ln(1 + c1 r^2 + c2 r^4 + c3 r^6), r = 1 at the picture's corner or
-the rim of its circle; differences between frames are rid of L(p) (after Goldman 2010, with
-known responses). Gauss-Newton. Weights follow local contrast, what moved or gleams is voted
-down. The mean of all e_i stays zero: the panorama keeps its exposure.
+the rim of its circle; differences between frames are rid of L(p) (after Goldman 2010).
+Gauss-Newton. Weights follow local contrast, what moved or gleams is voted down. The mean of all
+e_i stays zero: the panorama keeps its exposure.
+
+Of photographs whose response is not given it is an unknown as well: sum_k h_k phi_k(L_i t_i) is
+added to ln L_i, with phi_k by which real cameras differ from sRGB (Grossberg and Nayar 2004)
+and t_i the frame's exposure.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -16,7 +21,9 @@ from numpy.typing import NDArray
 
 from chromeball.envmap.mapping import Radial, of_camera
 from chromeball.envmap.stitch.frames import Frame
+from chromeball.hdr.prior import known_cameras
 from chromeball.scene.camera import CameraModel
+from chromeball.scene.color import srgb_decode
 
 type Array = NDArray[np.float64]
 
@@ -28,8 +35,12 @@ CURVE = 0.1
 FEW = 200  # samples of an overlap that tell half as much as many
 #: Prior standard deviations of e_i, of the c_k, and the relative noise of a sample.
 EXPOSURE, FALLOFF, NOISE = 1.0, 1.0, 0.002
-#: Terms of the fall-off.
-TERMS = 3
+#: Terms of the fall-off, and of the response where it is unknown.
+TERMS, CURVES = 3, 5
+#: ln sRGB at its codes but the first, on which response's terms are given.
+LEVELS = np.log(srgb_decode(np.arange(1, 256) / 255))
+#: Weights of R, G and B in what is compared.
+GREY = np.array([0.25, 0.5, 0.25])
 LEAST = 30  # samples below which nothing is solved
 
 
@@ -38,8 +49,10 @@ class Photometric:
     """``exposure`` (N, 3): ln of what each frame is brighter than the panorama, per channel.
 
     ``falloff`` (TERMS,): c1, c2, ... of 1 + c1 r^2 + c2 r^4 + ..., as `envmap probe` takes it.
-    ``exposure_sigma`` (N,) and ``falloff_sigma`` are standard errors; ``scatter`` the robust
-    relative scatter of overlaps before and after; ``samples`` how many comparisons;
+    ``exposure_sigma`` (N,) and ``falloff_sigma`` are standard errors; ``curve`` (255,): ln of
+    the camera's response over sRGB at LEVELS, zeros where the response is known; ``scatter``
+    the robust relative scatter of overlaps before and after; ``left`` (N,): median by which
+    each frame still differs from its neighbours, relative; ``samples`` how many comparisons;
     ``applied``: what was found is more than its error.
     """
 
@@ -47,24 +60,40 @@ class Photometric:
     falloff: Array
     exposure_sigma: Array
     falloff_sigma: Array
+    curve: Array
     scatter: tuple[float, float]
+    left: Array
     samples: int
     applied: bool
 
-    def gain(self, frame: int, camera: CameraModel) -> NDArray[np.float32]:
-        """What the radiance of a frame is multiplied by, (H, W, 3)."""
+    def corrected(self, frame: Frame, index: int, camera: CameraModel) -> NDArray[np.float32]:
+        """The radiance (H, W, 3) of frame number `index` on the panorama's scale."""
+        if not self.applied:
+            return frame.radiance
         width, height = camera.size
         x, y = np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float))
         r2 = radius2(camera, np.stack([x, y], axis=-1))
         fall = _falloff(r2, self.falloff)[0]
-        return (np.exp(-self.exposure[frame]) / fall[..., None]).astype(np.float32)
+        gain = (np.exp(-self.exposure[index]) / fall[..., None]).astype(np.float32)
+        if frame.assumed and self.curve.any():
+            level = np.log(np.maximum(frame.radiance * frame.gathered, 1e-9))
+            gain *= np.exp(np.interp(level, LEVELS, self.curve)).astype(np.float32)
+        return frame.radiance * gain
 
 
 def unchanged(count: int) -> Photometric:
     """Frames that are taken as they are."""
-    zero = np.zeros(TERMS)
+    terms, frames = np.zeros(TERMS), np.zeros(count)
     return Photometric(
-        np.zeros((count, 3)), zero, np.zeros(count), zero, (0.0, 0.0), 0, applied=False
+        exposure=np.zeros((count, 3)),
+        falloff=terms,
+        exposure_sigma=frames,
+        falloff_sigma=terms,
+        curve=np.zeros(len(LEVELS)),
+        scatter=(0.0, 0.0),
+        left=frames,
+        samples=0,
+        applied=False,
     )
 
 
@@ -89,7 +118,7 @@ def solve(
     exposure: bool = True,
     falloff: bool = True,
 ) -> Photometric:
-    """Exposures and fall-off that make overlapping frames agree.
+    """Exposures, fall-off and, where it is unknown, response that make frames agree.
 
     `rotations` (N, 3, 3) are world_from_camera. With `white_balance` the channels have
     exposures of their own.
@@ -107,16 +136,21 @@ def solve(
     a, b, p = (np.concatenate(v) if v else np.zeros(0, np.intp) for v in (first, second, where))
     if len(p) < LEAST or not (exposure or falloff):
         return unchanged(count)
-    grey = log @ np.array([0.25, 0.5, 0.25])
+    grey = log @ GREY
     ra, rb = r2[a, p], r2[b, p]
     sigma2 = 1 / weight[a, p] + 1 / weight[b, p]
     told_by_camera = all("metadata" in frame.source for frame in frames)
-    assumed = any(frame.source.startswith("sRGB") for frame in frames)
+    assumed = any(frame.assumed for frame in frames)
     trust = CURVE if told_by_camera else EXPOSURE
-    columns = count + TERMS
+    phi = _deviations() if assumed else np.zeros((0, len(LEVELS)))
+    exposed = np.array([math.log(f.gathered) if f.assumed else np.nan for f in frames])
+    bent = _compared(phi, log, exposed, a, p) - _compared(phi, log, exposed, b, p)
+    shared = TERMS + len(phi)
+    columns = count + shared
     prior = np.r_[
         np.full(count, 1 / trust**2 if exposure else 1e12),
         np.full(TERMS, 1 / FALLOFF**2 if falloff else 1e12),
+        np.ones(len(phi)),
     ]
 
     def normal(w: Array, y: Array, powers: Array) -> tuple[Array, Array]:
@@ -129,7 +163,7 @@ def solve(
         wp = w[:, None] * powers
         for sign, index in ((1.0, a), (-1.0, b)):
             cross = np.stack(
-                [np.bincount(index, wp[:, k], count) for k in range(TERMS)], axis=-1
+                [np.bincount(index, wp[:, k], count) for k in range(shared)], axis=-1
             )
             matrix[:count, count:] += sign * cross
             matrix[count:, :count] += sign * cross.T
@@ -139,13 +173,15 @@ def solve(
         return matrix, right
 
     def model(x: Array) -> tuple[Array, Array]:
-        """Differences that unknowns explain, and their slopes by the c_k."""
-        (va, sa), (vb, sb) = _falloff(ra, x[count:]), _falloff(rb, x[count:])
-        return x[a] - x[b] + np.log(va / vb), sa - sb
+        """Differences that unknowns explain, and their slopes by the c_k and h_k."""
+        c, h = np.split(x[count:], [TERMS])
+        (va, sa), (vb, sb) = _falloff(ra, c), _falloff(rb, c)
+        said = x[a] - x[b] + np.log(va / vb) - bent @ h
+        return said, np.concatenate([sa - sb, -bent], axis=1)
 
     y = grey[a, p] - grey[b, p]
     x, scale, matrix = np.zeros(columns), 0.0, np.eye(columns)
-    powers = np.zeros((len(p), TERMS))
+    powers = np.zeros((len(p), shared))
     for _ in range(30):
         said, powers = model(x)
         t = (y - said) / np.sqrt(sigma2)
@@ -159,11 +195,9 @@ def solve(
             w *= number / (number + FEW) / (np.bincount(pair, w)[pair] * CURVE**2)
         matrix, right = normal(w, y - said, powers)
         step = np.linalg.solve(matrix, right - prior * x)
-        fall = x[count:] + step[count:]
-        # a fall-off that is not positive is a step too far
-        while _falloff(np.linspace(0, 1, 65), fall)[0].min() < 0.02:
+        # a fall-off that is not positive, or a response that does not rise, is a step too far
+        while not _possible(x[count:] + step[count:], phi):
             step = step / 2
-            fall = x[count:] + step[count:]
         x = x + step
         if float(np.abs(step).max()) < 1e-9:
             break
@@ -186,19 +220,54 @@ def solve(
     channels -= channels.mean(axis=0)
     fitted = y - model(x)[0]
     before = 1.4826 * float(np.median(np.abs(y)))
-    e, fall = x[:count] - x[:count].mean(), x[count:]
+    e = x[:count] - x[:count].mean()
+    fall, h = np.split(x[count:], [TERMS])
     told = bool(
-        (np.abs(e) > 3 * error[:count]).any() or _tells(fall, covariance[count:, count:])
+        (np.abs(e) > 3 * error[:count]).any() or _tells(x[count:], covariance[count:, count:])
     )
     told |= white_balance
     return Photometric(
         exposure=channels if told else np.zeros((count, 3)),
         falloff=fall if told else np.zeros(TERMS),
         exposure_sigma=error[:count],
-        falloff_sigma=error[count:],
+        falloff_sigma=error[count : count + TERMS],
+        curve=h @ phi if told else np.zeros(len(LEVELS)),
         scatter=(before, 1.4826 * float(np.median(np.abs(fitted)))),
+        left=_left(fitted if told else y, a, b, count),
         samples=len(p),
         applied=told,
+    )
+
+
+def _deviations() -> Array:
+    """Phi (CURVES, 255): how far real responses are from sRGB, ln exposure at its codes."""
+    cameras = known_cameras()
+    srgb = LEVELS - LEVELS[127]  # zero at code 128
+    return np.vstack([cameras.mean[1:] - srgb, cameras.components[: CURVES - 1, 1:]])
+
+
+def _compared(
+    phi: Array, log: Array, exposed: Array, frame: NDArray[np.intp], place: NDArray[np.intp]
+) -> Array:
+    """Phi (S, CURVES) of samples of frames, none for those whose response is known."""
+    level = log[frame, place] + np.nan_to_num(exposed)[frame, None]
+    values = [np.interp(level, LEVELS, one) @ GREY for one in phi]
+    table = np.stack(values, axis=-1) if values else np.zeros((len(frame), 0))
+    return np.where(np.isnan(exposed)[frame, None], 0, table)
+
+
+def _possible(shared: Array, phi: Array) -> bool:
+    """Whether the fall-off is positive and the response rises."""
+    c, h = np.split(shared, [TERMS])
+    rises = bool((np.diff(LEVELS + h @ phi) > 0).all())
+    return rises and float(_falloff(np.linspace(0, 1, 65), c)[0].min()) >= 0.02
+
+
+def _left(differences: Array, a: NDArray[np.intp], b: NDArray[np.intp], count: int) -> Array:
+    """Median of |differences| of each frame, (N,); 0 for one without overlaps."""
+    both, size = np.concatenate([a, b]), np.tile(np.abs(differences), 2)
+    return np.array(
+        [np.median(size[both == k]) if (both == k).any() else 0.0 for k in range(count)]
     )
 
 

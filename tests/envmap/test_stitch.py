@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -29,10 +30,11 @@ from chromeball.envmap.stitch.lens import (
 )
 from chromeball.envmap.stitch.links import Prior
 from chromeball.envmap.stitch.orient import Oriented, orient
-from chromeball.envmap.stitch.photometric import radius2, solve, unchanged
+from chromeball.envmap.stitch.photometric import Photometric, radius2, solve, unchanged
 from chromeball.envmap.stitch.rotations import Matches, adjust, angle_between, exp
 from chromeball.envmap.stitch.seams import find_seams
 from chromeball.scene.camera import WORLD_FROM_LATLONG, CameraModel
+from chromeball.scene.color import srgb_decode, srgb_encode
 from chromeball.scene.errors import UserError
 from chromeball.scene.image import read_image, write_exr
 from chromeball.scene.manifest import read_scene
@@ -231,6 +233,7 @@ def test_exposures_and_fall_off_are_found_and_the_energy_stays() -> None:
         for k, (p, e) in enumerate(zip(pictures(), given, strict=True))
     ]
     light = solve(frames, LENS, turns())
+    assert not light.curve.any()  # radiance has no response
     assert np.abs(light.exposure[:, 1] - given).max() < 2e-3
     at = np.linspace(0, 1, 5)[:, None] ** np.arange(1, 4)
     assert np.abs(at @ light.falloff - (-0.3 * at[:, 0] + 0.05 * at[:, 1])).max() < 5e-3
@@ -244,6 +247,43 @@ def test_exposures_and_fall_off_are_found_and_the_energy_stays() -> None:
     inner = seen & (solid > 0.3 * solid.max())
     error = np.abs(result.radiance / truth - 1)[inner]
     assert np.percentile(error, 99) < 0.05
+
+
+def test_a_response_that_is_not_srgb_is_found() -> None:
+    """Photographs of known exposures, with the contrast that cameras add."""
+    times = np.exp2(np.array([0.0, -1.0, 1.0, -0.5, 0.5, -1.5, 0.0]))
+    brightest = max(float(p.max()) for p in pictures())
+    frames: list[Frame] = []
+    for k, (picture, t) in enumerate(zip(pictures(), times, strict=True)):
+        v = srgb_encode(np.clip(0.5 * picture / brightest * t, 0, 1))
+        codes = np.round(255 * (v - 0.07 * np.sin(2 * np.pi * v)))
+        linear = (srgb_decode(codes / 255) / t).astype(np.float32)
+        frames.append(Frame(
+            str(k), linear, None, (codes >= 250).any(axis=2), "sRGB, exposure from metadata",
+            gathered=float(t),
+        ))  # fmt: skip
+
+    def error(light: Photometric) -> float:
+        parts: list[NDArray[np.float64]] = []
+        for k, (frame, truth) in enumerate(zip(frames, pictures(), strict=True)):
+            assert frame.clipped is not None
+            use = ~frame.clipped & (truth.min(axis=2) > 0.02 * brightest)
+            made = light.corrected(frame, k, LENS)
+            parts.append(np.log(made[use] / truth[use]).ravel())
+        off = np.concatenate(parts)
+        return float(np.std(off))
+
+    found = solve(frames, LENS, turns())
+    assert np.abs(found.exposure).max() < 0.1
+    assert error(unchanged(7)) > 0.15
+    assert error(found) < 0.35 * error(unchanged(7))
+    assert found.left.max() < 0.03
+    # photographs that are sRGB stay so
+    for k, frame in enumerate(frames):
+        v = srgb_encode(np.clip(0.5 * pictures()[k] / brightest * times[k], 0, 1))
+        linear = srgb_decode(np.round(255 * v) / 255) / times[k]
+        frames[k] = replace(frame, radiance=linear.astype(np.float32))
+    assert error(solve(frames, LENS, turns())) < 0.03
 
 
 def test_exposures_that_agree_are_kept() -> None:

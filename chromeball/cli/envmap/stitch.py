@@ -73,7 +73,8 @@ def stitch(
     clicked
         Number, from 1, of the frame that was aligned; by default the one named in align.json.
     response
-        The camera's response.json, for photographs; sRGB otherwise.
+        The camera's response.json, for photographs; otherwise it is found from where frames
+        overlap, from sRGB on.
     exposure
         auto: exposures and vignetting are made equal where frames overlap; keep: they are
         right; white-balance: each channel by itself.

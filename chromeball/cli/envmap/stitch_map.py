@@ -30,6 +30,10 @@ type Refine = Literal["none", "focal", "lens", "all"]
 type Bend = Literal["auto", "no"]
 type Expose = Literal["auto", "keep", "white-balance"]
 
+#: Codes whose response over sRGB is recorded, ln: 16, 64, 128, 192, 240.
+RESPONSE = [15, 63, 127, 191, 239]
+#: Frames that differ by more from their neighbours, relatively, are named.
+UNLIKE = 0.15
 #: Maps are no wider than this unless a width is asked for.
 WIDEST = 8192
 
@@ -117,6 +121,14 @@ def make_map(
                 f"{bends.largest:.0f} px, half of the held-out matches lie within "
                 f"{bends.held_out[1]:.2f} px instead of {bends.held_out[0]:.2f}"
             )
+        unlike = [k for k in range(len(names)) if light.left[k] > UNLIKE]
+        if unlike:
+            listed = ", ".join(f"{names[k]} by {100 * light.left[k]:.0f} %" for k in unlike)
+            notes.append(
+                f"still differ from their neighbours in brightness: {listed}; did the light "
+                "change, or does the camera adapt its curve to each picture? Use RAW, or a "
+                "bracket"
+            )
         for note in notes:
             print(f"note: {note}", file=sys.stderr)
         stage.figures |= {
@@ -129,7 +141,9 @@ def make_map(
             "exposure_sigma": light.exposure_sigma,
             "vignetting": light.falloff,
             "vignetting_sigma": light.falloff_sigma,
+            "response_over_srgb": light.curve[RESPONSE] if light.curve.any() else None,
             "overlap_scatter": light.scatter,
+            "overlap_left": light.left,
             "photometric": light.applied,
             "energy_error": result.energy_errors,
             "bend_px": None if bends is None else _bend_figures(bends),
@@ -183,8 +197,8 @@ def _read(files: Sequence[Path], response: Path | None) -> list[Frame]:
         raise UserError("the frames are radiance already; leave out --response", file=response)
     if any(kind.startswith("sRGB") for kind in kinds):
         print(
-            "note: photographs are made linear as sRGB; --response gives the camera's own "
-            "curve, and what is clipped in them stays a lower bound",
+            "note: photographs are made linear as sRGB, and better where frames overlap; "
+            "--response, from a bracket, is surer; what is clipped in them stays a lower bound",
             file=sys.stderr,
         )
     return frames
@@ -296,7 +310,7 @@ def _pictures(
     )
     checks = []
     for k, frame in enumerate(frames):
-        own = frame.radiance * light.gain(k, camera) if light.applied else frame.radiance
+        own = light.corrected(frame, k, camera)
         checks.append(through_lens(result.radiance, result.alpha, camera, rotations[k], own))
     worst = max(range(len(checks)), key=lambda k: checks[k].difference)
     stage.figures |= {
