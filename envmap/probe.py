@@ -36,6 +36,7 @@ class Shot:
     ``valid`` and ``clipped`` (H, W) or None, the latter lower bounds; ``yaw`` about the
     vertical, right-handed, ``pitch`` up and ``roll`` clockwise, radians. ``photographer``:
     half angle of the cone about the direction back to a ball's camera that is not used.
+    ``sigma`` (H, W, 3): standard deviations of independent pixels, or None.
     """
 
     radiance: NDArray[np.float32]
@@ -46,6 +47,7 @@ class Shot:
     valid: NDArray[np.bool_] | None = None
     photographer: float = 0.0
     clipped: NDArray[np.bool_] | None = None
+    sigma: NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True)
@@ -66,7 +68,8 @@ class Overlap:
 class Panorama:
     """``radiance`` (H, W, 3), black where unseen, and ``alpha`` (H, W), the seen part.
 
-    ``clipped`` (H, W) is the part that was too bright for every exposure, None if none was.
+    ``clipped`` (H, W) is the part that was too bright for every exposure, None if none was;
+    ``sigma`` (H, W, 3), or None where a shot has none.
     ``energy_error`` per shot: what resampling changed, relative.
     """
 
@@ -76,6 +79,7 @@ class Panorama:
     overlaps: tuple[Overlap, ...]
     energy_error: tuple[float, ...]
     hot_pixels: int
+    sigma: NDArray[np.float32] | None = None
 
 
 def rotation(yaw: float, pitch: float, roll: float) -> Array:
@@ -150,6 +154,8 @@ def combine(shots: Sequence[Shot], rotations: Sequence[Array], width: int) -> Pa
     weights = np.zeros(solid.shape, np.float32)
     alpha = np.zeros(solid.shape, np.float32)
     clipped = np.zeros(solid.shape, np.float32)
+    noisy = all(shot.sigma is not None for shot in shots)
+    variance = np.zeros_like(total) if noisy else None
     seen: list[tuple[NDArray[np.float32], NDArray[np.bool_]]] = []
     errors: list[float] = []
     hot = 0
@@ -161,6 +167,8 @@ def combine(shots: Sequence[Shot], rotations: Sequence[Array], width: int) -> Pa
         weight = shot_weight(shot, turn, world) * result.coverage
         total += weight[..., None] * result.radiance
         weights += weight
+        if variance is not None and result.sigma is not None:
+            variance += (weight[..., None] * result.sigma) ** 2
         alpha = np.maximum(alpha, np.where(weight > 0, result.coverage, 0))
         if shot.clipped is not None and shot.clipped.any():
             turned = turn @ shot.mapping.rotation.T
@@ -173,6 +181,9 @@ def combine(shots: Sequence[Shot], rotations: Sequence[Array], width: int) -> Pa
     known = weights > 0
     total[known] /= weights[known][:, None]
     clipped[known] /= weights[known]
+    sigma = None if variance is None else np.sqrt(variance)
+    if sigma is not None:
+        sigma[known] /= weights[known][:, None]
     return Panorama(
         radiance=total,
         alpha=alpha,
@@ -180,6 +191,7 @@ def combine(shots: Sequence[Shot], rotations: Sequence[Array], width: int) -> Pa
         overlaps=_overlaps(seen, solid),
         energy_error=tuple(errors),
         hot_pixels=hot,
+        sigma=sigma,
     )
 
 
@@ -192,7 +204,9 @@ def _pixel(mapping: Mapping) -> float:
 def _placed(shot: Shot, world_from_shot: Array, target: Mapping) -> Warped:
     # by `rotation`: a turned mapping would make its tables anew
     turn = world_from_shot @ shot.mapping.rotation.T
-    return warp(shot.radiance, shot.mapping, target, rotation=turn, valid=shot.valid)
+    return warp(
+        shot.radiance, shot.mapping, target, rotation=turn, valid=shot.valid, sigma=shot.sigma
+    )
 
 
 def shot_weight(shot: Shot, world_from_shot: Array, world: Array) -> NDArray[np.float32]:
@@ -234,8 +248,9 @@ def without_vignetting(shot: Shot, coefficients: Sequence[float]) -> Shot:
         When the lens has no image circle or the fall-off is not positive inside it.
 
     """
-    gain = vignetting_gain(shot.mapping, coefficients).astype(np.float32)
-    return replace(shot, radiance=shot.radiance * gain[..., None])
+    gain = vignetting_gain(shot.mapping, coefficients).astype(np.float32)[..., None]
+    sigma = None if shot.sigma is None else shot.sigma * gain
+    return replace(shot, radiance=shot.radiance * gain, sigma=sigma)
 
 
 def vignetting_gain(mapping: Mapping, coefficients: Sequence[float]) -> Array:

@@ -199,7 +199,9 @@ def test_finished_panorama(tmp_path: Path) -> None:
     source = LatLong((512, 256)).turned(pose.rotation)
     lamp = (source.directions() @ np.array([0, 0.6, 0.8]) > math.cos(0.1)).astype(float)
     theirs = np.dstack([world(source.directions()), lamp])
-    write_exr(tmp_path / "theirs.exr", theirs, channels=("R", "G", "B", "clipped"))
+    theirs = np.dstack([theirs, 0.01 * theirs[..., :3]])
+    names = ("R", "G", "B", "clipped", "sigma.R", "sigma.G", "sigma.B")
+    write_exr(tmp_path / "theirs.exr", theirs, channels=names)
     x, z = np.array([-0.6, 0.6, 0.6, -0.6]), np.array([0.4, 0.4, -0.4, -0.4])
     clicks = camera.posed(pose).project_world(np.stack([x, np.zeros(4), z], axis=1))
     points = ", ".join(f"[{u:.4f}, {v:.4f}]" for u, v in clicks)
@@ -217,6 +219,9 @@ def test_finished_panorama(tmp_path: Path) -> None:
     middle = np.einsum("hw,hwc->c", marked, mapping.directions())
     np.testing.assert_allclose(middle / np.linalg.norm(middle), [0, 0.6, 0.8], atol=0.01)
     assert marked.sum() == pytest.approx(2 * math.pi * (1 - math.cos(0.1)), rel=0.05)
+    noise = made.pixels[..., made.channels.index("sigma.G")]
+    share = np.median(noise / (0.01 * made.pixels[..., 1]))
+    assert 0.2 < share < 0.5  # 16 pixels of theirs make one, and neighbours overlap
 
 
 @pytest.mark.parametrize("kind", ["mirror", "angular", "cube", "latlong", "fisheye"])

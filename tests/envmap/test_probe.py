@@ -132,6 +132,28 @@ def test_vignetting_is_divided_out() -> None:
     np.testing.assert_allclose(mended.radiance, plain.radiance, rtol=1e-4)
 
 
+def test_noise_is_carried_with_the_light() -> None:
+    """Sigma of the map is the scatter of many maps; half where two shots see the same."""
+    rng = np.random.default_rng(0)
+    lens = of_camera(CameraModel.fisheye("equisolid", (64, 64), 3.8))
+    even = np.ones((64, 64, 3), np.float32)
+    shots = [Shot(even, lens, yaw) for yaw in (0.0, math.pi)]
+    level = np.full((64, 64, 3), 0.1, np.float32) * [0.5, 1, 2]
+    turns = world_from_shots(shots)
+    told = combine([replace(s, sigma=level.astype(np.float32)) for s in shots], turns, 64)
+    assert told.sigma is not None
+
+    def noisy(shot: Shot) -> Shot:
+        return replace(shot, radiance=(even + rng.normal(size=even.shape) * level).astype("f4"))
+
+    many = [combine([noisy(s) for s in shots], turns, 64).radiance for _ in range(100)]
+    seen = told.alpha > 0.99
+    ratio = np.std(many, axis=0)[seen] / told.sigma[seen]
+    # neighbours are correlated by the spline: the mean of variances is compared
+    assert np.sqrt(np.mean(ratio**2)) == pytest.approx(1, abs=0.1)
+    assert combine(shots, turns, 64).sigma is None
+
+
 def test_bad_vignetting() -> None:
     with pytest.raises(UserError, match="vignetting falls"):
         vignetting_gain(of_camera(LENS), [-2.0])

@@ -159,8 +159,14 @@ def write_panorama(
     origin: Any,
     completed: Any,
     clipped: Any = None,
+    sigma: Any = None,
 ) -> None:
-    """A lat-long map with alpha, marks (H, W), attributes and preview."""
+    """A lat-long map with alpha, marks (H, W), attributes and preview.
+
+    `sigma` (H, W, 3) of what is completed is as large as its light.
+    """
+    import numpy as np
+
     from chromeball.envmap.picture import (
         latlong_attributes,
         tone_mapped,
@@ -171,6 +177,9 @@ def write_panorama(
     marks = {"A": alpha, "completed": completed}
     if clipped is not None:
         marks["clipped"] = clipped
+    if sigma is not None:
+        noise = np.where((alpha > 0)[..., None], sigma, radiance)
+        marks |= {f"sigma.{name}": noise[..., k] for k, name in enumerate("RGB")}
     for name in ("origin", "worldToCamera"):
         kept.pop(name, None)
     stage.figures["preview"] = write_preview(output, "preview", tone_mapped(radiance, alpha))

@@ -164,6 +164,7 @@ def make_map(request: Request, output: Path, as_json: bool) -> None:
             origin,
             completed,
             result.clipped,
+            result.sigma,
         )
     if unseen > 0.01:
         print(
@@ -184,7 +185,7 @@ def _shot(request: Request, k: int, image: Radiance) -> tuple[Shot, float | None
 
     file, ball = request.files[k], request.balls[k]
     camera = _camera(request.lenses[k], image.size, file)
-    rgb, valid, clipped = image.rgb, image.valid, image.clipped
+    rgb, valid, clipped, sigma = image.rgb, image.valid, image.clipped, image.sigma
     mask = request.masks[k]
     if mask is not None:
         allowed = read_mask(mask, image.size, file)
@@ -195,7 +196,9 @@ def _shot(request: Request, k: int, image: Radiance) -> tuple[Shot, float | None
             seen, part = ball_in_circle(image.size, (x, y), radius, camera).cut_out()
         except UserError as error:
             raise UserError(error.what, file=file) from error
-        rgb = np.ascontiguousarray(rgb[part] / np.array(request.reflectance, np.float32))
+        reflectance = np.array(request.reflectance, np.float32)
+        rgb = np.ascontiguousarray(rgb[part] / reflectance)
+        sigma = None if sigma is None else np.ascontiguousarray(sigma[part] / reflectance)
         valid = None if valid is None else np.ascontiguousarray(valid[part])
         clipped = None if clipped is None else clipped[part]
         mapping: Mapping = Lens((rgb.shape[1], rgb.shape[0]), camera=seen)
@@ -206,7 +209,7 @@ def _shot(request: Request, k: int, image: Radiance) -> tuple[Shot, float | None
     if not 0 <= request.photographer < 120:
         raise UserError(f"--photographer {request.photographer:g}: from 0 to 120 degrees")
     back = math.radians(request.photographer) if ball is not None else 0.0
-    shot = Shot(rgb, mapping, a, b, c, valid, back, clipped)
+    shot = Shot(rgb, mapping, a, b, c, valid, back, clipped, sigma)
     try:
         if request.vignetting:
             shot = without_vignetting(shot, request.vignetting)

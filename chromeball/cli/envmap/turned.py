@@ -38,7 +38,7 @@ def turn_panorama(
             pose, _ = read_alignment(aligned)
             source, origin = source.turned(pose.rotation), pose.translation
         target = LatLong((width, width // 2))
-        result = resample(image.rgb, source, target, valid=image.valid)
+        result = resample(image.rgb, source, target, valid=image.valid, sigma=image.sigma)
         clipped = None
         if image.clipped is not None and image.clipped.any():
             clipped = carry(image.clipped, source, target, valid=image.valid)
@@ -53,6 +53,14 @@ def turn_panorama(
             ),
         }
         write_panorama(
-            stage, output, result.radiance, result.coverage, kept, origin, completed, clipped
+            stage,
+            output,
+            result.radiance,
+            result.coverage,
+            kept,
+            origin,
+            completed,
+            clipped,
+            result.sigma,
         )
     print_figures(stage.figures, as_json, output)
