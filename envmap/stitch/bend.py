@@ -119,14 +119,16 @@ def bent(frame: Frame, shifts: Array) -> Frame:
         got = cv2.remap(given.astype(np.uint8), *maps, cv2.INTER_NEAREST)
         return np.asarray(got) > 0
 
-    radiance = cv2.remap(
-        frame.radiance, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-    )
+    def moved(picture: NDArray[np.float32]) -> NDArray[np.float32]:
+        got = cv2.remap(picture, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(got, np.float32)
+
     return replace(
         frame,
-        radiance=np.asarray(radiance, np.float32),
+        radiance=moved(frame.radiance),
         valid=inside if frame.valid is None else inside & mask(frame.valid),
         clipped=None if frame.clipped is None else mask(frame.clipped),
+        sigma=None if frame.sigma is None else moved(frame.sigma),
     )
 
 

@@ -36,7 +36,8 @@ class Patch:
     """A frame in the lat-long, cropped: ``left`` may wrap around.
 
     ``radiance`` (h, w, 3), ``coverage`` (h, w); ``energy_error``: what resampling changed;
-    ``clipped`` (h, w) the share of lower bounds, None where there are none.
+    ``clipped`` (h, w) the share of lower bounds, None where there are none; ``sigma``
+    (h, w, 3) or None.
     """
 
     radiance: Picture
@@ -45,6 +46,7 @@ class Patch:
     left: int
     energy_error: float
     clipped: Picture | None = None
+    sigma: Picture | None = None
 
     def place(self, width: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Rows and columns of the map, for indexing."""
@@ -61,7 +63,8 @@ class Composite:
     resampling; ``limited`` pixels whose blend was held near the frames', ``limited_share`` what
     that changed of the energy; ``blend_energy`` what the bands changed of it, relative;
     ``clipped`` (H, W) the share of each pixel that is a lower bound in its frame, or None where
-    no frame says.
+    no frame says; ``sigma`` (H, W, 3) the standard deviation of the frame that a pixel is of,
+    or None where one does not tell it.
     """
 
     radiance: Picture
@@ -74,6 +77,7 @@ class Composite:
     limited_share: float
     blend_energy: float
     clipped: Picture | None = None
+    sigma: Picture | None = None
 
 
 def compose(
@@ -99,8 +103,7 @@ def compose(
         if progress is not None:
             progress(f"resampling {frame.name}")
         source = of_camera(camera).turned(rotations[k]) if mappings is None else mappings[k]
-        radiance = photometric.corrected(frame, k, camera)
-        patches.append(_patch(radiance, frame, source, target))
+        patches.append(_patch(photometric.corrected(frame, k, camera), source, target))
         clips.append(_clipped(frame, of_camera(camera).turned(rotations[k]), small))
     low = np.stack([_reduced(p, p.radiance, width, small.size) for p in patches])
     covered = np.stack([_reduced(p, p.coverage, width, small.size) for p in patches])
@@ -143,6 +146,7 @@ def _blend(
     high = np.zeros((height, width, 3), np.float32)
     chosen = ground.copy()
     clipped = np.zeros_like(alpha) if any(p.clipped is not None for p in patches) else None
+    sigma = np.zeros_like(ground) if all(p.sigma is not None for p in patches) else None
     for k, patch in enumerate(patches):
         at = patch.place(width)
         usable = patch.coverage > 0.5
@@ -155,6 +159,8 @@ def _blend(
         hot[at] += np.where(mask[..., None], patch.radiance - base, 0)
         if clipped is not None and patch.clipped is not None:
             clipped[at] = np.where(mask, patch.clipped, clipped[at])
+        if sigma is not None and patch.sigma is not None:
+            sigma[at] = np.where(mask[..., None], patch.sigma, sigma[at])
         pyramid.add(np.where(sees, base - ground[at], 0), mask.astype(np.float32), patch)
     blended = ground + pyramid.collapse()
     bounded = np.clip(blended, LIMITS[0] * np.where(np.isfinite(low), low, 0), LIMITS[1] * high)
@@ -177,6 +183,7 @@ def _blend(
         limited_share=energy(bounded - np.where(seen[..., None], blended, 0)) / everything,
         blend_energy=energy(bounded) / max(energy(chosen), 1e-300) - 1,
         clipped=clipped,
+        sigma=sigma,
     )
 
 
@@ -243,15 +250,16 @@ class _Pyramid:
         return result
 
 
-def _patch(radiance: Picture, frame: Frame, source: Mapping, target: LatLong) -> Patch:
-    result = warp(radiance, source, target, valid=frame.valid)
+def _patch(frame: Frame, source: Mapping, target: LatLong) -> Patch:
+    result = warp(frame.radiance, source, target, valid=frame.valid, sigma=frame.sigma)
     seeable = float((result.source_energy - result.outside).sum())
     error = float(result.energy.sum()) / seeable - 1 if seeable > 0 else 0.0
     rows = np.flatnonzero(result.coverage.any(axis=1))
     columns = result.coverage.any(axis=0)
     if rows.size == 0:
         empty = np.zeros((1, 1), np.float32)
-        return Patch(np.zeros((1, 1, 3), np.float32), empty, 0, 0, error)
+        black = np.zeros((1, 1, 3), np.float32)
+        return Patch(black, empty, 0, 0, error, sigma=None if frame.sigma is None else black)
     width = len(columns)
     left, across = 0, width
     if not columns.all():
@@ -265,7 +273,9 @@ def _patch(radiance: Picture, frame: Frame, source: Mapping, target: LatLong) ->
     clipped = None
     if frame.clipped is not None and frame.clipped.any():
         clipped = carry(frame.clipped, source, target, valid=frame.valid)[where]
-    return Patch(result.radiance[where], result.coverage[where], top, left, error, clipped)
+    sigma = None if result.sigma is None else result.sigma[where]
+    light = result.radiance[where], result.coverage[where]
+    return Patch(*light, top, left, error, clipped, sigma)
 
 
 def _small(size: tuple[int, int]) -> tuple[int, int]:

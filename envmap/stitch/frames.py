@@ -31,6 +31,7 @@ class Frame:
     None: lower bounds. ``source`` says how it became linear; ``focal35`` the focal length as
     it would be on 36 x 24 mm, from the metadata, or None. ``gathered``: exposure that was
     divided out; of a photograph ``radiance * gathered`` is what its codes say, from 0 to 1.
+    ``sigma`` (H, W, 3): standard deviations of independent pixels, or None.
     """
 
     name: str
@@ -41,6 +42,7 @@ class Frame:
     focal35: float | None = None
     attributes: dict[str, Any] = field(default_factory=dict[str, Any])
     gathered: float = 1.0
+    sigma: NDArray[np.float32] | None = None
 
     @property
     def assumed(self) -> bool:
@@ -79,6 +81,7 @@ def read_frame(path: str | os.PathLike[str], response: Response | None = None) -
             clipped,
             focal35=focal,
             attributes=found.attributes,
+            sigma=found.sigma,
         )
     codes = image.pixels[..., :3]
     if codes.shape[2] < 3:

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,10 +66,10 @@ class Photometric:
     samples: int
     applied: bool
 
-    def corrected(self, frame: Frame, index: int, camera: CameraModel) -> NDArray[np.float32]:
-        """The radiance (H, W, 3) of frame number `index` on the panorama's scale."""
+    def corrected(self, frame: Frame, index: int, camera: CameraModel) -> Frame:
+        """Frame number `index` with its light on the panorama's scale."""
         if not self.applied:
-            return frame.radiance
+            return frame
         width, height = camera.size
         x, y = np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float))
         r2 = radius2(camera, np.stack([x, y], axis=-1))
@@ -78,7 +78,8 @@ class Photometric:
         if frame.assumed and self.curve.any():
             level = np.log(np.maximum(frame.radiance * frame.gathered, 1e-9))
             gain *= np.exp(np.interp(level, LEVELS, self.curve)).astype(np.float32)
-        return frame.radiance * gain
+        sigma = None if frame.sigma is None else frame.sigma * gain
+        return replace(frame, radiance=frame.radiance * gain, sigma=sigma)
 
 
 def unchanged(count: int) -> Photometric:

@@ -17,6 +17,7 @@ from chromeball.cli.main import build_app
 from chromeball.cli.stages import stages
 from chromeball.envmap.mapping import LatLong, of_camera
 from chromeball.envmap.probe import rotation
+from chromeball.envmap.resample import warp
 from chromeball.envmap.stitch.bend import bend, bent
 from chromeball.envmap.stitch.blend import compose
 from chromeball.envmap.stitch.directions import read_directions
@@ -274,7 +275,7 @@ def test_a_response_that_is_not_srgb_is_found() -> None:
         for k, (frame, truth) in enumerate(zip(frames, pictures(), strict=True)):
             assert frame.clipped is not None
             use = ~frame.clipped & (truth.min(axis=2) > 0.02 * brightest)
-            made = light.corrected(frame, k, LENS)
+            made = light.corrected(frame, k, LENS).radiance
             parts.append(np.log(made[use] / truth[use]).ravel())
         off = np.concatenate(parts)
         return float(np.std(off))
@@ -324,6 +325,26 @@ def test_clipped_light_stays_marked() -> None:
     assert result.clipped[d @ lamp < math.cos(reach + 0.02)].max() == 0
     plain = [Frame(str(k), p) for k, p in enumerate(pictures())]
     assert compose(plain, LENS, turns(), 512, unchanged(7)).clipped is None
+
+
+def test_noise_is_that_of_the_frame_that_is_seen() -> None:
+    noise = [(0.02 + 0.01 * k) * p for k, p in enumerate(pictures())]
+    brighter = np.exp(np.linspace(-0.3, 0.3, 7))
+    frames = [
+        Frame(str(k), p * np.float32(e), sigma=(s * e).astype(np.float32))
+        for k, (p, s, e) in enumerate(zip(pictures(), noise, brighter, strict=True))
+    ]
+    result = compose(frames, LENS, turns(), 512, solve(frames, LENS, turns()))
+    assert result.sigma is not None
+    source = of_camera(LENS).turned(turns()[2])
+    sigma = noise[2].astype(np.float32)
+    alone = warp(pictures()[2], source, LatLong((512, 256)), sigma=sigma)
+    own = (result.labels == 2) & (alone.coverage > 0.999)
+    assert own.sum() > 1000
+    assert alone.sigma is not None
+    np.testing.assert_allclose(result.sigma[own], alone.sigma[own], rtol=0.02)
+    frames[3] = replace(frames[3], sigma=None)
+    assert compose(frames, LENS, turns(), 512, unchanged(7)).sigma is None
 
 
 def test_a_sun_is_one_sun_and_does_not_ring() -> None:

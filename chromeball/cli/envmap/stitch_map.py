@@ -173,6 +173,7 @@ def make_map(
             origin,
             completed,
             result.clipped,
+            result.sigma,
         )
     print_figures(stage.figures, as_json, output)
 
@@ -310,7 +311,7 @@ def _pictures(
     )
     checks = []
     for k, frame in enumerate(frames):
-        own = light.corrected(frame, k, camera)
+        own = light.corrected(frame, k, camera).radiance
         checks.append(through_lens(result.radiance, result.alpha, camera, rotations[k], own))
     worst = max(range(len(checks)), key=lambda k: checks[k].difference)
     stage.figures |= {
