@@ -59,7 +59,8 @@ class Adjusted:
 
     ``rotations`` (N, 3, 3) world_from_camera; ``camera`` the shared lens; ``inliers`` (M,);
     ``residuals`` (M,) in pixels of the frames, unweighted; ``sigma`` (N,) standard error of
-    each rotation against the mean of all, radians (per axis, worst); ``lens_sigma`` of the
+    each rotation against the mean of all, radians (per axis, worst), the tracker's for a frame
+    without matches, infinite without one; ``lens_sigma`` of the
     lens's unknowns; ``condition`` of the normal equations, gauge left out; ``prior_residual``
     (N,) angle from the tracker's rotation, radians, NaN where there is none.
     """
@@ -166,8 +167,9 @@ def adjust(
         e, jacobian = tried
         if float(np.abs(step[:size]).max()) < SETTLED and scale <= 1.01 * floor:
             break
+    told = np.full(count, math.inf) if prior_sigma is None else prior_sigma
     return _summary(
-        problem, rotations, lens, scale, prior, known, iteration, freedom, lens_prior
+        problem, rotations, lens, scale, prior, told, iteration, freedom, lens_prior
     )
 
 
@@ -278,7 +280,7 @@ def _summary(
     lens: CameraModel,
     scale: float,
     prior: Array | None,
-    known: NDArray[np.bool_],
+    prior_sigma: Array,
     iterations: int,
     freedom: Freedom,
     lens_prior: Array,
@@ -298,15 +300,20 @@ def _summary(
         hessian = hessian - curved
     if freedom.count:
         hessian[size:, size:] += np.diag(float(np.mean(weight * norm**2)) / 2 / lens_prior**2)
-    # free network: errors against the mean of all rotations, which the matches leave open
+    linked = np.bincount(problem.frames[alive].ravel(), minlength=count) > 0
+    # free network: errors against the mean of all rotations, which the matches leave open;
+    # frames without matches take no part
     gauge = np.zeros((size + freedom.count, 3))
-    gauge[:size] = np.tile(np.eye(3), (count, 1))
-    unit = 1 / np.sqrt(np.maximum(np.diag(hessian), 1e-300))
+    gauge[:size] = np.kron(linked[:, None], np.eye(3))
+    free = np.diag(hessian) > 0
+    free[:size] &= np.repeat(linked, 3)
+    unit = np.where(free, 1 / np.sqrt(np.where(free, np.diag(hessian), 1)), 0)
     scaled = hessian * unit[:, None] * unit[None, :]
     values, vectors = np.linalg.eigh(scaled)
+    lost = int((~free).sum()) + 3  # and the gauge
     kept = values > 1e-10 * values[-1]
-    kept[:3] = False  # the gauge
-    positive = values[3:]
+    kept[:lost] = False
+    positive = values[lost:]
     condition = (
         float(positive[-1] / max(positive[0], 1e-18 * positive[-1]))
         if len(positive)
@@ -318,7 +325,7 @@ def _summary(
     project = np.eye(len(gauge)) - gauge @ np.linalg.pinv(gauge)
     covariance = project @ covariance @ project.T
     spread = np.sqrt(np.maximum(np.diag(covariance), 0))
-    linked = np.bincount(problem.frames[alive].ravel(), minlength=count) > 0
+    known = np.isfinite(prior_sigma)
     off = np.full(count, np.nan)
     if prior is not None:
         off[known] = angle_between(rotations[known], prior[known])
@@ -329,7 +336,7 @@ def _summary(
         camera=lens,
         inliers=inliers,
         residuals=problem.pixels_off(rotations, lens),
-        sigma=np.where(linked, spread[:size].reshape(-1, 3).max(axis=1), math.inf),
+        sigma=np.where(linked, spread[:size].reshape(-1, 3).max(axis=1), prior_sigma),
         lens_sigma=spread[size:],
         condition=condition,
         prior_residual=off,

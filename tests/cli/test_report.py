@@ -124,7 +124,7 @@ def test_figures_have_units_and_long_ones_are_folded(recorded: Path) -> None:
     assert "rms0.183px" in text.replace(" ", "")
     assert "range17.3stops" in text.replace(" ", "")
     assert "views (9 rows)" in text
-    assert "noisenot finite" in text.replace("noise ", "noise")
+    assert "noise\N{EN DASH}" in text.replace("noise ", "noise")
     assert found.tags.count("details") >= 16
 
 
@@ -290,7 +290,7 @@ def test_sorting_figures() -> None:
 @pytest.mark.parametrize(
     ("value", "text"),
     [
-        (None, "not finite"),
+        (None, "\N{EN DASH}"),
         (True, "yes"),
         (12345678, "12\u202f345\u202f678"),
         (0.0, "0"),

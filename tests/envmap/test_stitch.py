@@ -196,6 +196,10 @@ def test_frames_without_overlap() -> None:
     assert [list(g) for g in found.groups] == [[0, 1], [2]]
     assert any("placed by the tracker alone" in note for note in found.notes)
     assert angle_between(found.rotations[2], prior.rotations[3]) < math.radians(0.8)
+    # what the pictures tell is as exact as without the third, which is the tracker's
+    pair = orient(few[:2], LENS, prior=Prior(prior.rotations[:2], prior.sigma[:2]))
+    np.testing.assert_allclose(found.adjusted.sigma[:2], pair.adjusted.sigma, rtol=0.3)
+    assert found.adjusted.sigma[2] == prior.sigma[3]
 
 
 def test_matches_by_chance_say_nothing_of_the_lens() -> None:

@@ -123,7 +123,7 @@ def show(value: Any) -> str:
     """A value as text: four digits, lists in one line, nothing invented for null."""
     match value:
         case None:
-            return "not finite"
+            return "\N{EN DASH}"
         case bool():
             return "yes" if value else "no"
         case int():
