@@ -290,6 +290,12 @@ class _Planner:
 
     def _import(self, bracket: Bracket, name: str, take: str, users: list[str]) -> StagePlan:
         frames = self._expanded(bracket)
+        if len(frames) < 2:
+            raise UserError(
+                f"bracket {bracket.name!r} has one picture, merging needs two or more: take "
+                "single photographs or finished radiance to a map with `envmap stitch` or "
+                "`envmap probe`, and name that map as `file` in [env]; a view takes a `plate`"
+            )
         if bracket.times and len(bracket.times) != len(frames):
             raise UserError(
                 f"bracket {bracket.name!r} has {len(frames)} frames "

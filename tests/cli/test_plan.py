@@ -382,7 +382,7 @@ def test_a_bracket_for_the_response_alone_is_taken_but_not_merged(root: Path) ->
     text = changed(
         "[render]",
         '[hdr]\nsolve_from = ["grey"]\n[[bracket]]\nname = "grey"\n'
-        'frames = ["photos/g.jpg"]\n[render]',
+        'frames = ["photos/g.jpg", "photos/h.jpg"]\n[render]',
     )
     plan = planned(text, root)
     assert plan["take grey"].needed
@@ -414,6 +414,7 @@ def test_an_emulated_camera_stands_before_the_bracket(root: Path) -> None:
         ("board_*", "nothing_*", r"no picture matches 'photos/nothing_\*.jpg'"),
         ("times = [0.1, 0.2]", "times = [0.1]", "'plate' has 2 frames but 1 times"),
         ('"photos/p2.jpg"', '"photos/p1.jpg"', "names 'photos/p1.jpg' twice"),
+        (', "photos/p2.jpg"', "", "'plate' has one picture"),
         ('"photos/p2.jpg"', '"photos/p2.exr"', "mixes linear frames with others"),
         ('picture = "front"', 'picture = "plate"', "known: front, back"),
         ('folder = "build"', 'folder = "../x"', "within the scene's own folder"),
