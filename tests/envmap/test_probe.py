@@ -341,12 +341,12 @@ def test_a_soft_rim_is_trimmed() -> None:
 
 
 def test_a_lens_is_refined_from_the_overlap() -> None:
-    """Said to be 190 degrees and centred; it is 201, its circles off by two pixels."""
+    """Said to be 190 degrees and centred; it is 201, its circles off by two pixels of 180."""
     truth = CameraModel.fisheye(
-        "equidistant", (260, 260), math.radians(201), centre=(131.5, 127.5), radius=125.0
+        "equidistant", (180, 180), math.radians(201), centre=(91.0, 88.0), radius=86.5
     )
     said = CameraModel.fisheye(
-        "equidistant", (260, 260), math.radians(190), centre=(129.5, 129.5), radius=125.0
+        "equidistant", (180, 180), math.radians(190), centre=(89.5, 89.5), radius=86.5
     )
     base = WORLD_FROM_LATLONG.rotation
     poses = [base, rotation(0.02, -0.01, 0.015) @ rotation(math.pi, 0.0, 0.0) @ base]

@@ -490,8 +490,10 @@ def test_a_scene_is_planned_and_stitched(tmp_path: Path) -> None:
     shots = ""
     for k in range(3):
         write_exr(tmp_path / f"build/f{k}.exr", pictures()[k])
-        write_exr(tmp_path / f"r{k}.exr", pictures()[k])
-        shots += f'[[bracket]]\nname = "f{k}"\nframes = ["r{k}.exr"]\ntimes = [1]\n'
+        shots += f'[[bracket]]\nname = "f{k}"\nframes = ["r{k}.exr", "s{k}.exr"]\n'
+        shots += "times = [1, 2]\n"
+        for name in "rs":
+            write_exr(tmp_path / f"{name}{k}.exr", pictures()[k])
         shots += f'[[probe.shot]]\nbracket = "f{k}"\nyaw = {60 * k}\nroll = 90\npitch = -5\n'
     LENS.write(tmp_path / "lens.cameramodel")
     text = (

@@ -168,8 +168,8 @@ def test_a_lamp_that_is_seen_far_away() -> None:
 def _in_the_room() -> tuple[ProbeMap, list[CameraModel]]:
     place = np.array([-1.5, 1.2, 0.8])
     cameras = [
-        room.view([2.2, 1.5, 1.6], [-1.5, 0.3, -0.3], (96, 72)),
-        room.view([-2.2, 1.5, 1.6], [1.5, 0.3, 0.3], (96, 72)),
+        room.view([2.2, 1.5, 1.6], [-1.5, 0.3, -0.3], (64, 48)),
+        room.view([-2.2, 1.5, 1.6], [1.5, 0.3, 0.3], (64, 48)),
     ]
     return ProbeMap(room.panorama(place, width=128), place), cameras
 
