@@ -219,12 +219,14 @@ auto survey(const Rgb& rgb, const std::optional<Mask>& valid, const SolidAngles&
     for_rows(0, int(h), [&](int y) {
       RowSums row;
       const float* pixels = source.rgb + 3 * w * y;
+      thread_local std::vector<float> omega;
+      omega.resize(std::size_t(w));
+      const float own = source.solid(0, y);
       const bool even = source.solid.even && !valid;
-      if (!even || !survey_even_row(pixels, source.solid(0, y), w, cap, row)) {
-        thread_local std::vector<float> omega;
-        omega.resize(std::size_t(w));
+      if (!even || !survey_plain_row<true>(pixels, &own, w, cap, row)) {
         source.solid.row(y, omega.data());
-        row = survey_row(pixels, valid ? valid->data() + w * y : nullptr, omega.data(), w, cap);
+        if (valid || !survey_plain_row<false>(pixels, omega.data(), w, cap, row))
+          row = survey_row(pixels, valid ? valid->data() + w * y : nullptr, omega.data(), w, cap);
       }
       std::copy(row.sum, row.sum + 5, out + 5 * Index(y));
       bad += row.bad;

@@ -124,10 +124,16 @@ struct Projection {
             const float b = f.down.x * x + f.down.y * y + f.down.z * z;
             const bool more = w > best[k];
             best[k] = more ? w : best[k];
-            p.x[k] = more ? (a / w + 1) * half - 0.5f : p.x[k];
-            p.y[k] = more ? (b / w + 1) * half - 0.5f : p.y[k];
+            p.x[k] = more ? a : p.x[k];
+            p.y[k] = more ? b : p.y[k];
             p.sheet[k] = more ? i : p.sheet[k];
           }
+        }
+#pragma omp simd
+        for (int k = 0; k < n; ++k) {
+          const float scale = best[k] > 0 ? half / best[k] : 0.f;
+          p.x[k] = p.x[k] * scale + (half - 0.5f);
+          p.y[k] = p.y[k] * scale + (half - 0.5f);
         }
         return;
       }

@@ -40,29 +40,33 @@ inline RowSums survey_row(const float* rgb, const bool* valid, const float* soli
   return {{covered, top, red, green, blue}, bad};
 }
 
-// The same of a row whose pixels are all usable and have one solid angle: lanes of float, gathered
-// in double every 256 pixels. False where a pixel is bad.
-inline bool survey_even_row(const float* rgb, float solid, Index width, float cap, RowSums& row) {
+// The same of a row without a mask: lanes of float, gathered in double every 256 pixels. `solid` is
+// one for all where the row is `even`. False where a pixel is bad or a sum leaves float's range.
+template <bool even>
+bool survey_plain_row(const float* rgb, const float* solid, Index width, float cap, RowSums& row) {
   constexpr float kLargest = std::numeric_limits<float>::max();
-  row = {{double(solid) * double(width), 0, 0, 0, 0}, 0};
+  row = {{0, 0, 0, 0, 0}, 0};
   for (Index begin = 0; begin < width; begin += 256) {
     const Index end = std::min(width, begin + 256);
     std::int32_t bad = 0;
-    float top = 0, red = 0, green = 0, blue = 0;
+    float covered = 0, top = 0, red = 0, green = 0, blue = 0;
 #pragma omp simd reduction(| : bad)
     for (Index k = 3 * begin; k < 3 * end; ++k) bad |= (rgb[k] >= 0) & (rgb[k] <= kLargest) ? 0 : 1;
     if (bad) return false;
-#pragma omp simd reduction(+ : top, red, green, blue)
+#pragma omp simd reduction(+ : covered, top, red, green, blue)
     for (Index x = begin; x < end; ++x) {
       const float r = rgb[3 * x], g = rgb[3 * x + 1], b = rgb[3 * x + 2];
-      top += least(most(most(r, g), b), cap);
-      red += r, green += g, blue += b;
+      const float w = even ? 1.f : solid[x];
+      covered += w;
+      top += w * least(most(most(r, g), b), cap);
+      red += w * r, green += w * g, blue += w * b;
     }
     if (!(top <= kLargest && red <= kLargest && green <= kLargest && blue <= kLargest)) return false;
-    row.sum[1] += double(top), row.sum[2] += double(red);
+    row.sum[0] += double(covered), row.sum[1] += double(top), row.sum[2] += double(red);
     row.sum[3] += double(green), row.sum[4] += double(blue);
   }
-  for (int c = 1; c < 5; ++c) row.sum[c] *= double(solid);
+  if (even)
+    for (double& sum : row.sum) sum *= double(*solid);
   return true;
 }
 
