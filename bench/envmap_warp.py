@@ -146,11 +146,11 @@ def _measure(
         sums = np.einsum("hwc,hw->c", truth.astype(float), weight)
         rmse[kind].append(math.sqrt(off * 3 * weight.sum()) / float(sums.sum()))
         if kind == "resolved":
-            goal = sums
-            if whole:  # what was given, less what is not judged
+            area, goal = weight, sums
+            if whole:  # all of it, and what was given
+                area = solid
                 goal = np.einsum("hwc,hw->c", picture.astype(float), source.solid_angles())
-                goal -= np.einsum("hwc,hw->c", truth.astype(float), solid * ~clear)
-            energy.append(float(np.abs(np.einsum("hwc,hw->c", got, weight) / goal - 1).max()))
+            energy.append(float(np.abs(np.einsum("hwc,hw->c", got, area) / goal - 1).max()))
     reach = max(math.radians(2.5), 7 / target.density)
     suns = _directions([source, target], reach)
     lit = _lit(source, suns)
