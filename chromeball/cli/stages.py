@@ -530,6 +530,8 @@ class _Planner:
         name = "envmap probe"
         scene, probe = self.scene, self.scene.probe
         if scene.env.file:
+            if scene.env.ground or scene.env.fill:
+                raise UserError("env.ground and env.fill are not for a finished panorama")
             aligned = (f"{self.build}/align.json",) if scene.align else ()
             return StagePlan(
                 name,
@@ -842,6 +844,7 @@ class _Planner:
                 "light": scene.light,
                 "render": scene.render,
                 "view": view,
+                **({"others": scene.env.others} if scene.env.others else {}),
             },
         )
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from cyclopts import App, Parameter
 
+from chromeball.cli.options import Numbers
 from chromeball.scene.errors import UserError
 from chromeball.scene.manifest import StandIn, read_scene
 from chromeball.scene.record import Stage, to_json
@@ -82,8 +83,8 @@ def floor(
 @app.command
 def polygon(
     *,
-    points: str | None = None,
-    corners: str | None = None,
+    points: Numbers = None,
+    corners: Numbers = None,
     outline: Outline = "polygon",
     surface: Surface = "support",
     env: Map = None,
@@ -118,8 +119,8 @@ def polygon(
 @app.command
 def box(
     *,
-    points: str | None = None,
-    corners: str | None = None,
+    points: Numbers = None,
+    corners: Numbers = None,
     outline: Outline = "polygon",
     height: float | None = None,
     height_point: str | None = None,
@@ -160,8 +161,8 @@ def box(
 @app.command
 def room(
     *,
-    points: str | None = None,
-    corners: str | None = None,
+    points: Numbers = None,
+    corners: Numbers = None,
     outline: Outline = "polygon",
     height: float | None = None,
     height_point: str | None = None,

@@ -7,6 +7,7 @@ are left out.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -16,6 +17,9 @@ from chromeball.envmap.stitch.pairs import Link, nearest
 from chromeball.envmap.stitch.rotations import angle_between, exp, log
 
 type Array = NDArray[np.float64]
+
+#: How far cameras that nobody tracks are rolled and tilted, radians.
+ROLL, PITCH = math.radians(3), math.radians(25)
 
 
 def groups(count: int, pairs: Sequence[tuple[int, int]]) -> list[list[int]]:
@@ -131,18 +135,20 @@ def to_prior(
 def level(rotations: Array) -> Array:
     """The turn that stands an untracked panorama upright, its first frame ahead (+Z).
 
-    A photographer turns the camera about the vertical: the picture's right, or its bottom where
-    it was held upright, is level in all frames (Brown and Lowe 2007, section 5).
+    A photographer turns the camera about the vertical: the picture's right is level in all
+    frames (Brown and Lowe 2007, section 5), and less surely its axis: up is the least
+    eigenvector of sum x x^T / ROLL^2 + z z^T / PITCH^2. Of cameras held upright, which go round
+    far enough to tell, the picture's bottom is level, and its right is up.
     """
-    best: tuple[float, Array] | None = None
-    for axis in (0, 1):
-        values, vectors = np.linalg.eigh(rotations[:, :, axis].T @ rotations[:, :, axis])
-        # two small values: all frames face one way, and up is the mean of theirs
-        certain = values[1] > 4 * values[0] + 1e-6 * len(rotations)
-        if certain and (best is None or values[0] < best[0]):
-            best = (float(values[0]), vectors[:, 0])
-    tops = -rotations[:, :, 1].sum(axis=0)
-    up = best[1] if best is not None else tops / max(float(np.linalg.norm(tops)), 1e-12)
+    x, y, z = np.moveaxis(rotations, -1, 0)
+    aimed = z.T @ z / PITCH**2
+    (wide, up), (tall, side) = (
+        (values[0], vectors[:, 0])
+        for values, vectors in (np.linalg.eigh(v.T @ v / ROLL**2 + aimed) for v in (x, y))
+    )
+    tops = -y.sum(axis=0)
+    if tall + 0.5 * len(rotations) < wide:
+        up, tops = side, x.sum(axis=0)
     if up @ tops < 0:
         up = -up
     ahead = rotations[0][:, 2]

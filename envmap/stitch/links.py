@@ -12,12 +12,15 @@ from numpy.typing import NDArray
 from chromeball.envmap.stitch.features import RATIO, Features, match
 from chromeball.envmap.stitch.lens import Freedom, pixel_focal, refinable, scaled_focal
 from chromeball.envmap.stitch.pairs import LEAST, Link, believable, find_rotations
+from chromeball.envmap.stitch.rotations import angle_between
 from chromeball.scene.camera import CameraModel
 
 type Array = NDArray[np.float64]
 
 #: Features of a frame that look for partners when nothing says where it looked.
 BLIND = 1000
+#: Share of the best rotation's matches with which another one is as likely.
+ALIKE = 0.3
 #: Ratio test where the place is known to a degree.
 GUIDED_RATIO = 0.85
 #: Focal lengths that are tried where the lens is not certain, times the given one.
@@ -208,6 +211,19 @@ def blind_links(
     if not links:  # chance agreements say nothing of the lens
         return [], given, []
     return links, camera, notes
+
+
+def look_alike(links: Sequence[Link], tolerance: float) -> list[tuple[int, int]]:
+    """Pairs of frames that fit each other in several ways, nearly as well: repeats."""
+    best: dict[tuple[int, int], Link] = {}
+    doubtful: set[tuple[int, int]] = set()
+    for link in sorted(links, key=lambda link: -len(link.matches)):
+        pair = (link.first, link.second)
+        first = best.setdefault(pair, link)
+        apart = angle_between(first.rotation[None], link.rotation[None])[0]
+        if apart > 10 * tolerance and len(link.matches) > ALIKE * len(first.matches):
+            doubtful.add(pair)
+    return sorted(doubtful)
 
 
 def likeliest(

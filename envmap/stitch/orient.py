@@ -20,16 +20,20 @@ from chromeball.envmap.stitch.links import (
     Prior,
     blind_links,
     guided_links,
+    look_alike,
     rescued_links,
     tolerance_of,
     tracked_links,
 )
 from chromeball.envmap.stitch.pairs import LEAST, Link
-from chromeball.envmap.stitch.rotations import Adjusted, Matches, adjust, log
+from chromeball.envmap.stitch.rotations import Adjusted, Matches, adjust, angle_between, log
 from chromeball.scene.camera import CameraModel
 from chromeball.scene.errors import UserError
 
 type Array = NDArray[np.float64]
+
+#: Frames that are turned by less than this lie on each other, radians.
+SAME = math.radians(2)
 
 
 @dataclass(frozen=True)
@@ -104,6 +108,14 @@ def orient(
         notes += searched
         links += found
     tolerance = tolerance_of(camera, freedom)
+    alike = look_alike(links, tolerance) if prior is None else []
+    if alike:
+        listed = ", ".join(f"{names[i]}-{names[j]}" for i, j in alike[:6])
+        more = f" and {len(alike) - 6} more" if len(alike) > 6 else ""
+        notes.append(
+            f"these frames fit each other in several ways (repeats?): {listed}{more}; look at "
+            "the map, and say where they looked with --yaw or --directions"
+        )
     start, kept, refused = spread(count, links, 2 * tolerance)
     parts = groups(count, _pairs_of(kept))
     if len(parts) > 1 and blind:
@@ -134,6 +146,7 @@ def orient(
             raise _apart(parts, names)
         turned = level(adjusted.rotations) @ adjusted.rotations
         adjusted = replace(adjusted, rotations=turned)
+        notes += _same_way(adjusted.rotations)
     doubted = _doubted(adjusted, prior, parts, names, notes)
     if len(parts) > 1:
         alone = ["+".join(names[k] for k in part) for part in parts[1:]]
@@ -261,6 +274,19 @@ def _placed(
                 "only: check its axes, or whether it was disturbed"
             )
     return placed
+
+
+def _same_way(rotations: Array) -> list[str]:
+    """What is to be said of untracked frames most of which lie on others."""
+    count = len(rotations)
+    apart = angle_between(rotations[:, None], rotations[None]) + np.eye(count) * math.pi
+    same = int((apart.min(axis=1) < SAME).sum())
+    if same < max(2, count / 2):
+        return []
+    return [
+        f"{same} of {count} frames look the same way: if the camera was turned between them, "
+        "what it saw repeats (tiles, windows): say where it looked with --yaw or --directions"
+    ]
 
 
 def _doubted(

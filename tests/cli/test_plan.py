@@ -87,6 +87,14 @@ def test_a_finished_panorama_is_turned_and_not_stitched(root: Path) -> None:
     assert plan["envmap probe"].command[-2:] == ("-o", "build/env.exr")
     assert "finished panorama" in plan["envmap probe"].reason
     assert "build/env.exr" in plan["render main"].inputs
+    with pytest.raises(UserError, match="not for a finished panorama"):
+        planned(text.replace("[env]\n", "[env]\nground = [0.2, 0.2, 0.2]\n"), root)
+    # other maps that are left out again are light that changed, not only a file less
+    texts = [
+        planned(text.replace("[env]\n", f"[env]\n{others}"), root)["render main"].slice_text()
+        for others in ('others = ["a.exr", "b.exr"]\n', 'others = ["b.exr", "a.exr"]\n', "")
+    ]
+    assert len({*texts}) == 3
 
 
 def test_a_restored_sun_stands_between_the_shots_and_everything_else(root: Path) -> None:

@@ -246,6 +246,15 @@ def test_warp_there_and_back(tmp_path: Path, kind: str) -> None:
     np.testing.assert_allclose(energy, figures["source_energy"], rtol=2e-3)
 
 
+def test_a_turned_map_is_as_wide_as_it_was(tmp_path: Path) -> None:
+    write_exr(tmp_path / "in.exr", np.ones((74, 148, 3), np.float32))
+    run(
+        *("envmap", "warp", tmp_path / "in.exr", "--from", "latlong", "--to", "latlong"),
+        *("--rotate", "-30,5,0", "-o", tmp_path / "out.exr"),
+    )
+    assert read_image(tmp_path / "out.exr").size == (148, 74)
+
+
 def test_fisheye_to_fisheye(tmp_path: Path) -> None:
     source = tmp_path / "in.exr"
     write_exr(source, np.ones((60, 80, 3)))

@@ -23,6 +23,7 @@ from chromeball.envmap.stitch.blend import compose
 from chromeball.envmap.stitch.directions import read_directions
 from chromeball.envmap.stitch.features import Features, find
 from chromeball.envmap.stitch.frames import Frame
+from chromeball.envmap.stitch.graph import level
 from chromeball.envmap.stitch.lens import (
     Freedom,
     fov_of_frame,
@@ -66,7 +67,7 @@ def world(d: Array) -> NDArray[np.float32]:
 def turns() -> Array:
     """Six around, held upright, and one up: as a photographer would."""
     rng = np.random.default_rng(3)
-    around = [(60 * k, -5.0, 90.0) for k in range(6)] + [(10.0, 80.0, 0.0)]
+    around = [(60 * k, -5.0, -90.0) for k in range(6)] + [(10.0, 80.0, 0.0)]
     noisy = np.radians(np.array(around) + rng.normal(size=(7, 3)))
     return np.array([rotation(*a) @ BASE for a in noisy])
 
@@ -230,6 +231,45 @@ def test_tiles_are_told_apart_by_the_tracker() -> None:
 
 
 # ---- light
+
+
+@pytest.mark.parametrize("yaws", [(0, 45), (0, 3, 6, 9), tuple(range(0, 360, 45))])
+@pytest.mark.parametrize(("pitch", "roll"), [(0, 0), (-8, 0), (0, -90), (20, -90)])
+def test_untracked_frames_stand_upright(yaws: tuple[int, ...], pitch: int, roll: int) -> None:
+    if roll and max(yaws) < 45:
+        pytest.skip("all held upright and facing one way: nothing tells that from lying")
+    rng = np.random.default_rng(1)
+    held = np.array(
+        [
+            rotation(math.radians(yaw), 0.0, 0.0)
+            @ BASE
+            @ (BASE.T @ rotation(0.0, *np.radians(rng.normal([pitch, roll], 0.5))) @ BASE)
+            for yaw in yaws
+        ]
+    )
+    anyhow = exp(np.array([0.4, -1.0, 2.0]))
+    up = (level(anyhow @ held) @ anyhow @ held @ np.swapaxes(held, 1, 2))[:, 1, 1]
+    # tilt cannot be told from up where all look one way
+    limit = 3 if max(yaws) > 9 else 3 + abs(pitch)
+    assert np.degrees(np.arccos(np.clip(up, -1, 1))).max() < limit
+
+
+def test_frames_that_fit_in_several_ways_are_told() -> None:
+    """Walls that repeat: eight frames that were turned seem to look one way."""
+    mapping = of_camera(LENS)
+
+    def wall(d: Array) -> NDArray[np.float32]:
+        x, y, z = np.moveaxis(np.nan_to_num(d), -1, 0)
+        a, b = 8 * np.arctan2(x, z), 20 * np.arcsin(np.clip(y, -1, 1))  # every 45 degrees
+        mark = np.sin(a) * np.cos(b) + 0.6 * np.sin(2 * a + 1) * np.sin(3 * b) + np.cos(b / 2)
+        return np.exp(np.stack([mark] * 3, axis=-1)).astype(np.float32)
+
+    turned = [rotation(math.radians(45 * k), 0.0, 0.0) @ BASE for k in range(4)]
+    seen = [find(wall(mapping.turned(r).directions())) for r in turned]
+    found = orient(seen, LENS)
+    told = [n for n in found.notes if "several ways" in n or "same way" in n]
+    assert told or misplaced(found.rotations, np.array(turned)) < 0.1
+    assert not [n for n in orient(features(), LENS).notes if "way" in n]
 
 
 def test_exposures_and_fall_off_are_found_and_the_energy_stays() -> None:
@@ -494,7 +534,7 @@ def test_a_scene_is_planned_and_stitched(tmp_path: Path) -> None:
         shots += "times = [1, 2]\n"
         for name in "rs":
             write_exr(tmp_path / f"{name}{k}.exr", pictures()[k])
-        shots += f'[[probe.shot]]\nbracket = "f{k}"\nyaw = {60 * k}\nroll = 90\npitch = -5\n'
+        shots += f'[[probe.shot]]\nbracket = "f{k}"\nyaw = {60 * k}\nroll = -90\npitch = -5\n'
     LENS.write(tmp_path / "lens.cameramodel")
     text = (
         f'name = "test"\n[env]\nwidth = 128\n[probe]\nstitch = true\nsigma = 3\n'

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from chromeball.scene.manifest import Probe, Shot
 
 type Out = Annotated[Path, Parameter(name=["--output", "-o"])]
-#: Numbers with commas between, the first of which may be negative: --at -0.5,.8,.3.
-type Numbers = Annotated[str | None, Parameter(allow_leading_hyphen=True)]
 type Json = Annotated[bool, Parameter(negative="")]
 
 

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Literal
 
 from chromeball.cli.envmap.arguments import (
     Json,
-    Numbers,
     Out,
     parse_numbers,
     print_figures,
     read_camera,
 )
+from chromeball.cli.options import Numbers
 from chromeball.scene.errors import UserError
 
 if TYPE_CHECKING:

@@ -106,7 +106,14 @@ def target_map(kind: str, width: int | None, optics: Optics, source: Mapping) ->
 
     The width of ``cube-files`` is that of a face.
     """
-    from chromeball.envmap.mapping import MAPPINGS, make_mapping, of_camera, parse_lens, sized
+    from chromeball.envmap.mapping import (
+        MAPPINGS,
+        LatLong,
+        make_mapping,
+        of_camera,
+        parse_lens,
+        sized,
+    )
     from chromeball.scene.camera import CameraModel
 
     if kind == "fisheye":
@@ -127,7 +134,9 @@ def target_map(kind: str, width: int | None, optics: Optics, source: Mapping) ->
     if width is None:
         step = entry.step
         size = sized(name, 48 * step * entry.aspect[0])
-        wide = resolved(make_mapping(name, size), source, step)
+        made = make_mapping(name, size)
+        alike = isinstance(source, LatLong) and isinstance(made, LatLong)
+        wide = source.size[0] if alike else resolved(made, source, step)
     else:
         wide = width * faces
     size = sized(name, wide)

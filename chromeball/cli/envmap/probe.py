@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from chromeball.cli.envmap.arguments import Json, Numbers, Out, parse_numbers
+from chromeball.cli.envmap.arguments import Json, Out, parse_numbers
 from chromeball.cli.envmap.probe_map import Request, make_map
 from chromeball.cli.envmap.turned import turn_panorama
+from chromeball.cli.options import Numbers
 from chromeball.scene.errors import UserError
 
 if TYPE_CHECKING:

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 from chromeball.cli.envmap.arguments import (
     Json,
-    Numbers,
     Out,
     parse_numbers,
 )
 from chromeball.cli.envmap.stitch_map import Bend, Expose, Refine, make_map
+from chromeball.cli.options import Numbers
 from chromeball.scene.errors import UserError
 
 if TYPE_CHECKING:

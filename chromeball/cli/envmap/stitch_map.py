@@ -32,6 +32,8 @@ type Expose = Literal["auto", "keep", "white-balance"]
 
 #: Codes whose response over sRGB is recorded, ln: 16, 64, 128, 192, 240.
 RESPONSE = [15, 63, 127, 191, 239]
+#: More of the sphere that moved than this, sr, is told.
+MOVED = 0.3
 #: Frames that differ by more from their neighbours, relatively, are named.
 UNLIKE = 0.15
 #: Maps are no wider than this unless a width is asked for.
@@ -120,6 +122,12 @@ def make_map(
                 f"the camera moved between frames (parallax): they are bent by up to "
                 f"{bends.largest:.0f} px, half of the held-out matches lie within "
                 f"{bends.held_out[1]:.2f} px instead of {bends.held_out[0]:.2f}"
+            )
+        moved = result.seams.moved_solid_angle
+        if moved > MOVED:
+            notes.append(
+                f"much moved ({moved:.2f} sr of the map): each place is taken whole from one "
+                "frame; look at the seams"
             )
         unlike = [k for k in range(len(names)) if light.left[k] > UNLIKE]
         if unlike:

@@ -9,7 +9,8 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from chromeball.cli.envmap.arguments import Json, Numbers, Out, parse_numbers, print_figures
+from chromeball.cli.envmap.arguments import Json, Out, parse_numbers, print_figures
+from chromeball.cli.options import Numbers
 from chromeball.scene.errors import UserError
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from chromeball.cli.envmap.arguments import Json, Numbers, Out, parse_numbers, print_figures
+from chromeball.cli.envmap.arguments import Json, Out, parse_numbers, print_figures
+from chromeball.cli.options import Numbers
 from chromeball.scene.errors import UserError
 
 

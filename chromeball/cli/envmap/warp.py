@@ -14,13 +14,13 @@ from cyclopts import Parameter
 
 from chromeball.cli.envmap.arguments import (
     Json,
-    Numbers,
     Out,
     parse_numbers,
     print_figures,
     read_mask,
 )
 from chromeball.cli.envmap.maps import Optics, files_of, read_map, source_map, target_map
+from chromeball.cli.options import Numbers
 from chromeball.envmap.names import Kind
 from chromeball.scene.errors import UserError
 
