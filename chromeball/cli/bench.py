@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import importlib
+import itertools
 import math
 import sys
 import textwrap
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -24,6 +26,9 @@ if TYPE_CHECKING:
 STAGES = ("acquire", "hdr", "calibrate", "envmap", "stand_in", "renderer")
 BENCH = Path(__file__).resolve().parents[1] / "bench"
 RESULTS = Path("bench-results")
+#: Colours of our own points, and of the peers'.
+BLUES = ("#1f4e79", "#4f8fbf", "#8fb8d8", "#2a7f86")
+EARTHS = ("#8a5a2b", "#d09a3f", "#6b6b6b", "#b04a3a", "#7a4988", "#5f8f4f", "#b8b0a8")
 
 
 @dataclass(frozen=True)
@@ -119,11 +124,13 @@ def as_markdown(rows: Sequence[Row], skips: Sequence[Skip], *, quick: bool) -> s
 def plot_stage(stage: str, rows: Sequence[Row], output: Path) -> Path | None:
     """Plot time against error of one stage, a panel a task, then its curves; or nothing.
 
-    All axes are logarithmic, so that a row of zero or unknown error has no place in it.
+    All axes are logarithmic, so that a row of zero or unknown error has no place in it; nor has
+    a single one, with nothing beside it.
     """
     mine = [row for row in rows if row.stage == stage]
     pairs = [r for r in mine if r.cpu_seconds > 0 and r.error > 0 and math.isfinite(r.error)]
-    panels = [(what, False) for what in dict.fromkeys(row.what for row in pairs)]
+    counts = Counter(row.what for row in pairs)
+    panels = [(what, False) for what, count in counts.items() if count > 1]
     panels += [(what, True) for what in dict.fromkeys(r.what for r in mine if r.point)]
     if not panels:
         return None
@@ -132,7 +139,7 @@ def plot_stage(stage: str, rows: Sequence[Row], output: Path) -> Path | None:
 
     columns = min(3, len(panels))
     lines = math.ceil(len(panels) / columns)
-    figure = Figure(figsize=(4.4 * columns, 3.6 * lines), layout="constrained")
+    figure = Figure(figsize=(5.6 * columns, 3.4 * lines), layout="constrained")
     FigureCanvasAgg(figure)
     for i, (what, is_curve) in enumerate(panels):
         axes = figure.add_subplot(lines, columns, i + 1)
@@ -152,7 +159,8 @@ def plot_stage(stage: str, rows: Sequence[Row], output: Path) -> Path | None:
 
 
 def _plot_errors(axes: Axes, rows: Sequence[Row]) -> None:
-    """Time against error: a line a tool, its name at the first point."""
+    """Time against error: a line a tool, ours in blues, named beside the panel."""
+    colours = {True: itertools.cycle(BLUES), False: itertools.cycle(EARTHS)}
     for tool in dict.fromkeys(row.tool for row in rows):
         points = sorted((row.cpu_seconds, row.error) for row in rows if row.tool == tool)
         ours = tool.startswith("chromeball")
@@ -160,11 +168,12 @@ def _plot_errors(axes: Axes, rows: Sequence[Row]) -> None:
             *zip(*points, strict=True),
             marker="o" if ours else "s",
             markersize=9 if ours else 7,
-            color="#3f6f8f" if ours else "#b0aaa0",
+            color=next(colours[ours]),
+            label=textwrap.fill(tool, 24),
             linewidth=1,
             linestyle="--" if "+" in tool else "-",
         )
-        axes.annotate(tool, points[0], xytext=(7, 5), textcoords="offset points", fontsize=8)
+    axes.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1, 1), frameon=False)
     axes.set_xlabel("CPU s")
     axes.set_ylabel(f"error, {rows[0].unit}")
     axes.margins(0.35)

@@ -68,7 +68,6 @@ def test_table_json_and_plots(
         "table.md",
         "table.json",
         "hdr.png",
-        "acquire.png",
     }
     assert (results / "hdr.png").read_bytes().startswith(b"\x89PNG")
     lines = (results / "table.md").read_text().splitlines()
