@@ -116,7 +116,8 @@ def test_the_blank_example_is_a_whole_pipeline(tmp_path: Path) -> None:
     copy_example(folder, "blank", {"name": "garden"})
     for kind in ("probe", "plate", "board"):
         (folder / "photographs" / kind).mkdir(parents=True)
-        (folder / "photographs" / kind / "1.jpg").write_bytes(b"")
+        for name in ("1.jpg", "2.jpg"):
+            (folder / "photographs" / kind / name).write_bytes(b"")
     path = folder / "scene.toml"
     plan = stages(read_scene(path), path)
     skipped = {stage.name for stage in plan if not stage.needed}

@@ -343,8 +343,8 @@ def test_the_plan_merges_with_sigma_and_names_the_pictures(tmp_path: Path) -> No
     name = "s"
     [[bracket]]
     name = "plate"
-    frames = ["a.png"]
-    times = [1]
+    frames = ["a.png", "b.png"]
+    times = [1, 2]
     [env]
     file = "env.exr"
     [[object]]
