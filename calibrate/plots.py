@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import BoundaryNorm
 from matplotlib.figure import Figure
 
-from chromeball.calibrate.lens import Lens
+from chromeball.calibrate.lens_result import Lens
 
 #: Levels of the uncertainty map, pixels.
 LEVELS = (0, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 100)

@@ -1,0 +1,320 @@
+"""Least squares for one camera of any model before a board that may be bowed.
+
+Unknowns are the intrinsics, the bow and a pose for each view. Derivatives are exact, through
+the camera's own; the poses, which meet only in the intrinsics, are eliminated (the Schur
+complement of Triggs et al. 2000, section 6.1). Steps are Levenberg-Marquardt's, weights
+Cauchy's where corners may be wrong.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chromeball.scene.camera import CameraModel
+from chromeball.scene.errors import UserError
+
+#: Relative gain of the cost below which a step is the last.
+LEAST_GAIN = 1e-10
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A camera before V views of a board: p_camera = R (p + bow) + t.
+
+    ``rotations`` (V, 3, 3) and ``translations`` (V, 3); ``bow`` (2,), the deflection of the
+    board's middle, metres, along x and y: z = b_x (1 - x^2) + b_y (1 - y^2) with -1 and 1 at
+    the edges, as mrcal has it.
+    """
+
+    camera: CameraModel
+    bow: NDArray[np.float64]
+    rotations: NDArray[np.float64]
+    translations: NDArray[np.float64]
+
+    def views(self, chosen: NDArray[Any]) -> Estimate:
+        """The same camera before some of the views."""
+        return replace(
+            self, rotations=self.rotations[chosen], translations=self.translations[chosen]
+        )
+
+
+@dataclass(frozen=True)
+class Spread:
+    """How well an estimate is known, for corners with deviation 1 pixel.
+
+    ``shared`` (k + 2, k + 2), covariance of intrinsics and bow; ``turned`` (k + 3, k + 3), of
+    the intrinsics and of the mean turn of all boards about the camera's axes, which a picture
+    cannot tell from a change of the intrinsics. ``condition`` of the reduced normal equations
+    with unit diagonal.
+    """
+
+    shared: NDArray[np.float64]
+    turned: NDArray[np.float64]
+    condition: float
+
+
+def gradients(
+    camera: CameraModel, points: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Pixels (..., 2), d pixel / d point (..., 2, 3), d pixel / d intrinsics (..., 2, k)."""
+    if camera.model.startswith("LENSMODEL_"):
+        import mrcal
+
+        solver: Any = mrcal
+        values = solver.project(points, camera.model, camera.intrinsics, get_gradients=True)
+        q, by_point, by_intrinsics = (np.asarray(v, float) for v in values)
+        return q, by_point, by_intrinsics
+    q, by_point = camera.project_with_jacobian(points)
+    k = camera.intrinsics
+    two = len(k) > 3
+    focal, centre = (k[:2], k[2:4]) if two else (k[[0, 0]], k[1:3])
+    from_centre = (q - centre) / focal
+    by_intrinsics = np.zeros((*q.shape, len(k)))
+    if two:
+        by_intrinsics[..., [0, 1], [0, 1]] = from_centre
+    else:
+        by_intrinsics[..., 0] = from_centre
+    first = 2 if two else 1
+    by_intrinsics[..., [0, 1], [first, first + 1]] = 1
+    if camera.model == "kb4":
+        rho = np.hypot(points[..., 0], points[..., 1])
+        theta = np.arctan2(rho, points[..., 2])
+        along = points[..., :2] / np.where(rho > 0, rho, 1)[..., None]
+        powers = theta[..., None] ** np.array([3, 5, 7, 9])
+        by_intrinsics[..., 4:] = (focal * along)[..., None] * powers[..., None, :]
+    return q, by_point, by_intrinsics
+
+
+def residuals(
+    estimate: Estimate, board: NDArray[np.float64], corners: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Projected minus observed, (V, rows, columns, 2)."""
+    bowed = board + (_bow_shape(board) @ estimate.bow)[..., None] * [0.0, 0, 1]
+    points = _turned(estimate, bowed) + estimate.translations[:, None, None]
+    return gradients(estimate.camera, points)[0] - corners
+
+
+def adjust(
+    estimate: Estimate,
+    board: NDArray[np.float64],
+    corners: NDArray[np.float64],
+    used: NDArray[np.bool_],
+    *,
+    free: NDArray[np.bool_],
+    precision: NDArray[np.float64],
+    scale: float = math.inf,
+    steps: int = 30,
+) -> Estimate:
+    """The estimate of least cost, from a start.
+
+    Parameters
+    ----------
+    estimate
+        The start.
+    board
+        Corners on the flat board, (rows, columns, 3), metres.
+    corners
+        Observed pixels, (V, rows, columns, 2).
+    used
+        Which of them count, (V, rows, columns).
+    free
+        Which of the intrinsics and the two bows are unknown, (k + 2,).
+    precision
+        Weak knowledge that they are near zero: the inverse variance, times that of a corner.
+    scale
+        Cauchy's: a corner this many pixels off counts half; infinite for least squares.
+    steps
+        The most steps.
+
+    """
+    damping = 1e-4
+    cost, system = _linearise(estimate, board, corners, used, free, precision, scale)
+    for _ in range(steps):
+        candidate = _stepped(estimate, system, free, damping)
+        new_cost, new_system = math.inf, system
+        if candidate is not None:
+            new_cost, new_system = _linearise(
+                candidate, board, corners, used, free, precision, scale
+            )
+        if candidate is not None and new_cost <= cost:
+            gain = cost - new_cost
+            estimate, cost, system = candidate, new_cost, new_system
+            damping = max(damping / 10, 1e-10)
+            if gain <= LEAST_GAIN * cost:
+                break
+        elif damping > 1e8:
+            break
+        else:
+            damping *= 10
+    return estimate
+
+
+def spread(
+    estimate: Estimate,
+    board: NDArray[np.float64],
+    corners: NDArray[np.float64],
+    used: NDArray[np.bool_],
+    precision: NDArray[np.float64],
+) -> Spread:
+    """Covariances at a solution, (J'J)^-1, over all unknowns.
+
+    Raises
+    ------
+    UserError
+        When the normal equations are singular.
+
+    """
+    count = len(precision)
+    _, system = _linearise(
+        estimate, board, corners, used, np.ones(count, bool), precision, math.inf
+    )
+    views = len(estimate.rotations)
+    try:
+        schur, inverse, coupling = _reduce(system, 0.0)
+        size = np.sqrt(np.diag(schur))
+        condition = float(np.linalg.cond(schur / np.outer(size, size)))
+        shared = np.linalg.inv(schur / np.outer(size, size)) / np.outer(size, size)
+    except np.linalg.LinAlgError:
+        condition, shared = math.inf, np.zeros((0, 0))
+    if not condition < 1e13:
+        raise UserError(
+            "these pictures do not determine the lens: take more, with the board tilted and "
+            "all over the picture"
+        )
+    # A board's turn follows the shared unknowns by -coupling, and has its own noise.
+    follows = -coupling[:, :3].mean(axis=0)
+    own = inverse[:, :3, :3].sum(axis=0) / views**2
+    chosen = count - 2
+    turned = np.empty((chosen + 3, chosen + 3))
+    turned[:chosen, :chosen] = shared[:chosen, :chosen]
+    turned[chosen:, :chosen] = follows @ shared[:, :chosen]
+    turned[:chosen, chosen:] = turned[chosen:, :chosen].T
+    turned[chosen:, chosen:] = own + follows @ shared @ follows.T
+    return Spread(shared, turned, condition)
+
+
+# ---- the normal equations
+
+type System = tuple[
+    NDArray[np.float64],  # (s, s) of the shared unknowns
+    NDArray[np.float64],  # (V, 6, s) between poses and shared unknowns
+    NDArray[np.float64],  # (V, 6, 6) of the poses
+    NDArray[np.float64],  # (s,) gradient
+    NDArray[np.float64],  # (V, 6) gradient
+]
+
+
+def _linearise(
+    estimate: Estimate,
+    board: NDArray[np.float64],
+    corners: NDArray[np.float64],
+    used: NDArray[np.bool_],
+    free: NDArray[np.bool_],
+    precision: NDArray[np.float64],
+    scale: float,
+) -> tuple[float, System]:
+    """Cost, and J'J and J'e over the free unknowns; a pose's change is exp(w) R, t + dt."""
+    shape = _bow_shape(board)
+    bowed = board + (shape @ estimate.bow)[..., None] * [0.0, 0, 1]
+    turned = _turned(estimate, bowed)
+    q, by_point, by_intrinsics = gradients(
+        estimate.camera, turned + estimate.translations[:, None, None]
+    )
+    views = len(corners)
+    error = np.where(used[..., None], q - corners, 0.0)
+    square = (error**2).sum(axis=-1)
+    if math.isinf(scale):
+        cost, weight = float(square.sum()), used.astype(float)
+    else:
+        cost = float(scale**2 * np.log1p(square / scale**2).sum())
+        weight = used / (1 + square / scale**2)
+    # d pixel / d bow = d pixel / d point R e_z (1 - x^2)
+    normals = estimate.rotations[:, None, None, :, 2, None]
+    by_bow = (by_point @ normals) * shape[:, :, None]
+    shared = np.concatenate([by_intrinsics, by_bow], axis=-1)[..., free]
+    by_turn = np.cross(turned[..., None, :], by_point)
+    pose = np.concatenate([by_turn, by_point], axis=-1)
+    unused = ~used
+    shared[unused], pose[unused] = 0.0, 0.0
+
+    rows = 2 * used[0].size
+    w = np.repeat(weight.reshape(views, -1), 2, axis=1)[..., None]
+    a = shared.reshape(views, rows, int(free.sum()))
+    b = pose.reshape(views, rows, 6)
+    e = error.reshape(views, rows, 1)
+    a_t, b_t = np.swapaxes(w * a, 1, 2), np.swapaxes(w * b, 1, 2)
+    value = np.concatenate([estimate.camera.intrinsics, estimate.bow])[free]
+    known = precision[free]
+    cost += float(known @ value**2)
+    system = (
+        (a_t @ a).sum(axis=0) + np.diag(known),
+        b_t @ a,
+        b_t @ b,
+        (a_t @ e).sum(axis=0)[:, 0] + known * value,
+        (b_t @ e)[..., 0],
+    )
+    return cost if math.isfinite(cost) else math.inf, system
+
+
+def _reduce(
+    system: System, damping: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Schur complement (s, s), inverses of the poses' blocks, those times the coupling."""
+    shared, between, poses, _, _ = system
+    axis = np.arange(6)
+    damped = poses.copy()
+    damped[:, axis, axis] *= 1 + damping
+    inverse = np.linalg.inv(damped)
+    coupling = inverse @ between
+    schur = shared + damping * np.diag(np.diag(shared))
+    schur = schur - (np.swapaxes(between, 1, 2) @ coupling).sum(axis=0)
+    return schur, inverse, coupling
+
+
+def _stepped(
+    estimate: Estimate, system: System, free: NDArray[np.bool_], damping: float
+) -> Estimate | None:
+    """One damped step; None where the equations are singular or the camera impossible."""
+    from scipy.spatial.transform import Rotation
+
+    _, between, _, shared_gradient, pose_gradient = system
+    try:
+        schur, inverse, coupling = _reduce(system, damping)
+        own = (inverse @ pose_gradient[..., None])[..., 0]
+        right = -shared_gradient + (np.swapaxes(between, 1, 2) @ own[..., None]).sum(axis=0)[
+            :, 0
+        ]
+        size = np.sqrt(np.abs(np.diag(schur))) + 1e-300
+        shared = np.linalg.solve(schur / np.outer(size, size), right / size) / size
+    except np.linalg.LinAlgError:
+        return None
+    poses = -own - coupling @ shared
+    change = np.zeros(len(free))
+    change[free] = shared
+    intrinsics = estimate.camera.intrinsics + change[:-2]
+    focal = intrinsics[: 2 if len(intrinsics) > 3 else 1]
+    if not (np.isfinite(change).all() and np.isfinite(poses).all() and focal.min() > 0):
+        return None
+    return Estimate(
+        camera=replace(estimate.camera, intrinsics=intrinsics),
+        bow=estimate.bow + change[-2:],
+        rotations=Rotation.from_rotvec(poses[:, :3]).as_matrix() @ estimate.rotations,
+        translations=estimate.translations + poses[:, 3:],
+    )
+
+
+def _turned(estimate: Estimate, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """R p for every view, (V, rows, columns, 3)."""
+    return np.einsum("vij,rcj->vrci", estimate.rotations, points)
+
+
+def _bow_shape(board: NDArray[np.float64]) -> NDArray[np.float64]:
+    """1 - x^2 and 1 - y^2, (rows, columns, 2)."""
+    low, high = board.min(axis=(0, 1))[:2], board.max(axis=(0, 1))[:2]
+    place = (2 * board[..., :2] - low - high) / np.where(high > low, high - low, 1)
+    return np.asarray(1 - place**2, float)
