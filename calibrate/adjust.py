@@ -18,9 +18,6 @@ from numpy.typing import NDArray
 from chromeball.scene.camera import CameraModel
 from chromeball.scene.errors import UserError
 
-#: Relative gain of the cost below which a step is the last.
-LEAST_GAIN = 1e-10
-
 
 @dataclass(frozen=True)
 class Estimate:
@@ -109,13 +106,14 @@ def adjust(
     precision: NDArray[np.float64],
     scale: float = math.inf,
     steps: int = 30,
+    least_gain: float = 1e-10,
 ) -> Estimate:
     """The estimate of least cost, from a start.
 
     Parameters
     ----------
     estimate
-        The start.
+        The start; returned as it is where the lens does not see some corner at all.
     board
         Corners on the flat board, (rows, columns, 3), metres.
     corners
@@ -130,11 +128,13 @@ def adjust(
         Cauchy's: a corner this many pixels off counts half; infinite for least squares.
     steps
         The most steps.
+    least_gain
+        The relative gain of the cost below which a step is the last.
 
     """
     damping = 1e-4
     cost, system = _linearise(estimate, board, corners, used, free, precision, scale)
-    for _ in range(steps):
+    for _ in range(steps if math.isfinite(cost) else 0):
         candidate = _stepped(estimate, system, free, damping)
         new_cost, new_system = math.inf, system
         if candidate is not None:
@@ -145,7 +145,7 @@ def adjust(
             gain = cost - new_cost
             estimate, cost, system = candidate, new_cost, new_system
             damping = max(damping / 10, 1e-10)
-            if gain <= LEAST_GAIN * cost:
+            if gain <= least_gain * cost:
                 break
         elif damping > 1e8:
             break

@@ -6,6 +6,7 @@ Source: Zhang 2000 for what pictures of a plane determine.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -58,12 +59,28 @@ def choose_model(
     size: tuple[int, int],
     progress: Callable[[str, float], object] | None = None,
 ) -> tuple[str, dict[str, float]]:
-    """The model of :data:`CANDIDATES` with the least held-out error, and all their errors."""
+    """The model of :data:`CANDIDATES` with the least held-out error, and all their errors.
+
+    The error of a model that these corners do not determine, or that does not reach them, is
+    infinite.
+
+    Raises
+    ------
+    UserError
+        When that is so of all of them.
+
+    """
     errors: dict[str, float] = {}
+    refusal: UserError | None = None
     for model in CANDIDATES:
-        errors[model] = held_out_error(corners, target, size, model)
+        try:
+            errors[model] = held_out_error(corners, target, size, model)
+        except UserError as error:
+            errors[model], refusal = math.inf, error
         if progress is not None:
             progress(model, errors[model])
+    if refusal is not None and math.isinf(min(errors.values())):
+        raise refusal
     return min(errors, key=errors.__getitem__), errors
 
 

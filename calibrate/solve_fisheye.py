@@ -43,6 +43,8 @@ OUTLIER = 4.0
 #: A view of which fewer corners than this share fit was misread, and counts for nothing.
 LEAST_SHARE = 0.4
 FEWEST_CORNERS = 6
+#: The second pose of a board is a rival of the first up to so many times its error.
+RIVAL = 5.0
 
 
 @dataclass(frozen=True)
@@ -196,6 +198,8 @@ def _place(
         placed.append(view)
         misses = [_miss(pose.apply(points), rays) for pose in candidates]
         if scale is not None:
+            likely = min(misses) * RIVAL**2
+            candidates = [p for p, m in zip(candidates, misses, strict=True) if m <= likely]
             refined = [_refined(estimate, p, board, pixels, seen, scale) for p in candidates]
             candidates, misses = [p for p, _ in refined], [m for _, m in refined]
         poses.append(candidates[int(np.argmin(misses))])
@@ -229,7 +233,8 @@ def _refined(
     square = (residuals(one, board, pixels[None])[0][seen] ** 2).sum(axis=-1)
     left = square if math.isinf(scale) else np.log1p(square / scale**2)
     u, _, vt = np.linalg.svd(one.rotations[0])  # rounding alone
-    return Pose(u @ vt, one.translations[0]), float(left.sum())
+    # A pose that the lens cannot see is no rival.
+    return Pose(u @ vt, one.translations[0]), float(np.nan_to_num(left, nan=math.inf).sum())
 
 
 def _robust(
@@ -243,9 +248,16 @@ def _robust(
     """Cauchy's estimate, its scale renewed from the residuals."""
     for _ in range(rounds):
         scale = _scale(residuals(estimate, board, corners))
-        known = _precision(estimate.camera, board, scale)
         estimate = adjust(
-            estimate, board, corners, used, free=free, precision=known, scale=scale, steps=12
+            estimate,
+            board,
+            corners,
+            used,
+            free=free,
+            precision=_precision(estimate.camera, board, scale),
+            scale=scale,
+            steps=12,
+            least_gain=1e-4,  # the scale is a rough one, too
         )
     return estimate
 
@@ -301,6 +313,11 @@ def _judge(
 ) -> FisheyeLens:
     from scipy.spatial.transform import Rotation
 
+    frames = np.concatenate(
+        [Rotation.from_matrix(estimate.rotations).as_rotvec(), estimate.translations], axis=1
+    )
+    if largest_tilt(frames) < LEAST_TILT:
+        raise UserError(PARALLEL)
     error = residuals(estimate, board, corners[placed])
     sigma = _sigma(error[used], estimate)
     known = spread(
@@ -309,11 +326,6 @@ def _judge(
     count = len(estimate.camera.intrinsics)
     errors = sigma * np.sqrt(np.diag(known.shared)[:count])
     check_focal(estimate.camera.intrinsics, errors, 2 if count > 3 else 1)
-    frames = np.concatenate(
-        [Rotation.from_matrix(estimate.rotations).as_rotvec(), estimate.translations], axis=1
-    )
-    if largest_tilt(frames) < LEAST_TILT:
-        raise UserError(PARALLEL)
     left = np.full(corners.shape, np.nan)
     left[placed] = np.where(used[..., None], error, np.nan)
     poses = np.full((len(corners), 6), np.nan)

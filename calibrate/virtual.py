@@ -92,6 +92,30 @@ def board_poses(
     return poses
 
 
+def surrounding_poses(
+    target: Target, camera: CameraModel, count: int, seed: int = 0
+) -> list[Pose]:
+    """Poses of boards in all directions that a fisheye sees, facing it but for 40 degrees.
+
+    Their middles are half a board's diagonal to one and a half away; all corners are seen.
+    """
+    rng = np.random.default_rng(seed)
+    points = target.points().reshape(-1, 3)
+    middle, diagonal = points.mean(axis=0), float(np.linalg.norm(np.ptp(points, axis=0)))
+    poses: list[Pose] = []
+    while len(poses) < count:
+        theta, phi = camera.max_angle * np.sqrt(rng.random()), rng.uniform(0, 2 * np.pi)
+        axis = np.array([-np.sin(phi), np.cos(phi), 0])
+        turn = Pose.from_rotation_vector(theta * axis, np.zeros(3)).rotation
+        tilt = Pose.from_rotation_vector(rng.uniform(-0.7, 0.7, 3), np.zeros(3)).rotation
+        away = np.array([0, 0, diagonal * rng.uniform(0.5, 1.5)])
+        pose = Pose(turn @ tilt, turn @ (away - tilt @ middle))
+        seen = camera.project(pose.apply(points))
+        if (seen > 6).all() and (seen < np.array(camera.size) - 7).all():
+            poses.append(pose)
+    return poses
+
+
 def project(
     target: Target,
     camera: CameraModel,
