@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from bench import calibrate_fisheye
 from bench.row import Row
 from chromeball.calibrate.detect import detect
 from chromeball.calibrate.lens import calibrate_lens, pose_errors
@@ -24,7 +25,11 @@ FOLDS = 4
 
 def rows(quick: bool) -> list[Row]:
     """CPU seconds and errors of ours and of OpenCV's, interleaved."""
-    return [*_charuco(2 if quick else 8), *(_left() if DATA.is_dir() else [])]
+    return [
+        *_charuco(2 if quick else 8),
+        *(_left() if DATA.is_dir() else []),
+        *calibrate_fisheye.rows(quick),
+    ]
 
 
 def _left() -> list[Row]:

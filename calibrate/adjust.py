@@ -40,21 +40,6 @@ class Estimate:
         )
 
 
-@dataclass(frozen=True)
-class Spread:
-    """How well an estimate is known, for corners with deviation 1 pixel.
-
-    ``shared`` (k + 2, k + 2), covariance of intrinsics and bow; ``turned`` (k + 3, k + 3), of
-    the intrinsics and of the mean turn of all boards about the camera's axes, which a picture
-    cannot tell from a change of the intrinsics. ``condition`` of the reduced normal equations
-    with unit diagonal.
-    """
-
-    shared: NDArray[np.float64]
-    turned: NDArray[np.float64]
-    condition: float
-
-
 def gradients(
     camera: CameraModel, points: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
@@ -154,48 +139,40 @@ def adjust(
     return estimate
 
 
-def spread(
+def covariance(
     estimate: Estimate,
     board: NDArray[np.float64],
     corners: NDArray[np.float64],
     used: NDArray[np.bool_],
     precision: NDArray[np.float64],
-) -> Spread:
-    """Covariances at a solution, (J'J)^-1, over all unknowns.
+) -> tuple[NDArray[np.float64], float]:
+    """Covariance (k + 2, k + 2) of intrinsics and bow for corners of deviation 1 pixel.
+
+    It is the block of (J'J)^-1 over all unknowns. With it comes the condition of the reduced
+    normal equations, scaled to a unit diagonal.
 
     Raises
     ------
     UserError
-        When the normal equations are singular.
+        When they are singular.
 
     """
-    count = len(precision)
-    _, system = _linearise(
-        estimate, board, corners, used, np.ones(count, bool), precision, math.inf
-    )
-    views = len(estimate.rotations)
+    free = np.ones(len(precision), bool)
+    _, system = _linearise(estimate, board, corners, used, free, precision, math.inf)
     try:
-        schur, inverse, coupling = _reduce(system, 0.0)
+        schur, _, _ = _reduce(system, 0.0)
         size = np.sqrt(np.diag(schur))
-        condition = float(np.linalg.cond(schur / np.outer(size, size)))
-        shared = np.linalg.inv(schur / np.outer(size, size)) / np.outer(size, size)
+        scaled = schur / np.outer(size, size)
+        condition = float(np.linalg.cond(scaled))
+        inverse = np.linalg.inv(scaled) / np.outer(size, size)
     except np.linalg.LinAlgError:
-        condition, shared = math.inf, np.zeros((0, 0))
+        condition, inverse = math.inf, np.zeros_like(system[0])
     if not condition < 1e13:
         raise UserError(
             "these pictures do not determine the lens: take more, with the board tilted and "
             "all over the picture"
         )
-    # A board's turn follows the shared unknowns by -coupling, and has its own noise.
-    follows = -coupling[:, :3].mean(axis=0)
-    own = inverse[:, :3, :3].sum(axis=0) / views**2
-    chosen = count - 2
-    turned = np.empty((chosen + 3, chosen + 3))
-    turned[:chosen, :chosen] = shared[:chosen, :chosen]
-    turned[chosen:, :chosen] = follows @ shared[:, :chosen]
-    turned[:chosen, chosen:] = turned[chosen:, :chosen].T
-    turned[chosen:, chosen:] = own + follows @ shared @ follows.T
-    return Spread(shared, turned, condition)
+    return inverse, condition
 
 
 # ---- the normal equations
@@ -286,9 +263,9 @@ def _stepped(
     try:
         schur, inverse, coupling = _reduce(system, damping)
         own = (inverse @ pose_gradient[..., None])[..., 0]
-        right = -shared_gradient + (np.swapaxes(between, 1, 2) @ own[..., None]).sum(axis=0)[
-            :, 0
-        ]
+        right = (
+            -shared_gradient + (np.swapaxes(between, 1, 2) @ own[..., None]).sum(axis=0)[:, 0]
+        )
         size = np.sqrt(np.abs(np.diag(schur))) + 1e-300
         shared = np.linalg.solve(schur / np.outer(size, size), right / size) / size
     except np.linalg.LinAlgError:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from chromeball.calibrate.adjust import gradients
 from chromeball.calibrate.target import Target
 from chromeball.scene.camera import CameraModel
 from chromeball.scene.errors import UserError
@@ -35,7 +36,7 @@ class Lens(ABC):
     ``observed`` (V, R, C, 2) and ``residuals`` (V, R, C, 2) projected minus observed, NaN for
     outliers; ``outliers`` (V, R, C). ``rms`` per point over inliers; ``sigma`` the estimated
     standard deviation of one coordinate of a corner, freed from the fitted unknowns.
-    ``standard_errors`` of the intrinsics. ``bow`` (2,) the board's deflection, metres along x
+    ``covariance`` (k, k) of the intrinsics. ``bow`` (2,) the board's deflection, metres along x
     and y. ``camera_from_board`` (V, 6), rotation vector and translation; NaN for a view that
     was misread.
     """
@@ -46,7 +47,7 @@ class Lens(ABC):
     outliers: NDArray[np.bool_]
     rms: float
     sigma: float
-    standard_errors: NDArray[np.float64]
+    covariance: NDArray[np.float64]
     bow: NDArray[np.float64]
     camera_from_board: NDArray[np.float64]
 
@@ -54,12 +55,6 @@ class Lens(ABC):
     @abstractmethod
     def names(self) -> tuple[str, ...]:
         """Names of the intrinsics."""
-
-    @abstractmethod
-    def deviation(self, rays: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Standard deviation of the projection of points at infinity along unit `rays`
-        (..., 3) in the worst direction, pixels (...); NaN for NaN.
-        """  # noqa: D205
 
     @abstractmethod
     def pose_residuals(
@@ -72,6 +67,11 @@ class Lens(ABC):
     @abstractmethod
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write the ``.cameramodel``."""
+
+    @property
+    def standard_errors(self) -> NDArray[np.float64]:
+        """Of the intrinsics, (k,)."""
+        return np.sqrt(np.diag(self.covariance))
 
     @property
     def view_rms(self) -> NDArray[np.float64]:
@@ -108,7 +108,7 @@ class Lens(ABC):
         """Convex hull of the corners that were used, (N, 2)."""
         import cv2
 
-        seen = self.observed[np.isfinite(self.residuals[..., 0])]
+        seen = self._used_corners()
         return np.asarray(cv2.convexHull(seen.astype(np.float32)), np.float32).reshape(-1, 2)
 
     def tilt(self) -> float:
@@ -116,17 +116,37 @@ class Lens(ABC):
         return largest_tilt(self.camera_from_board)
 
     def uncertainty(self, columns: int = 30) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Standard deviation of projection at infinity in the worst direction, pixels.
+        """Standard deviation of projection in the worst direction over the picture, pixels.
 
-        Returns pixels (h, `columns`, 2) over the picture and values (h, `columns`).
-        It is the error from corner noise alone; what the model cannot express is not in it.
-        NaN where the model does not reach.
+        Returns pixels (h, `columns`, 2) over the picture and values (h, `columns`), NaN where
+        the model does not reach. It is :meth:`projection_covariance`'s larger axis.
         """
         width, height = self.camera.size
         rows = max(2, round(columns * height / width))
         x, y = np.meshgrid(np.linspace(0, width - 1, columns), np.linspace(0, height - 1, rows))
         pixels = np.stack([x, y], axis=-1)
-        return pixels, self.deviation(self._rays(pixels))
+        variance = self.projection_covariance(self._rays(pixels))
+        # The larger eigenvalue of [[a, b], [b, c]].
+        a, b, c = variance[..., 0, 0], variance[..., 0, 1], variance[..., 1, 1]
+        return pixels, np.sqrt((a + c) / 2 + np.hypot((a - c) / 2, b))
+
+    def projection_covariance(self, rays: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Covariance (..., 2, 2) of where points at infinity along unit `rays` are seen, px^2.
+
+        Other intrinsics look like a turned camera in part, which no use of the lens minds: the
+        turn w that fits best over the corners is taken out, dq = dq/di di + dq/dp (w x p). It
+        is the error from corner noise alone; what the model cannot express is not in it.
+        """
+        by_turn, by_intrinsics = self._sensitivity(self._rays(self._used_corners()))
+        known = np.isfinite(by_turn).all(axis=(1, 2))
+        w = -np.linalg.lstsq(
+            by_turn[known].reshape(-1, 3),
+            by_intrinsics[known].reshape(-1, len(self.covariance)),
+            rcond=None,
+        )[0]
+        by_turn, by_intrinsics = self._sensitivity(rays)
+        j = by_intrinsics + by_turn @ w
+        return np.asarray(j @ self.covariance @ np.swapaxes(j, -1, -2), float)
 
     def figures(self) -> dict[str, Any]:
         """Figures of quality for the record."""
@@ -162,6 +182,16 @@ class Lens(ABC):
         k = self.camera.intrinsics
         fx, fy, cx, cy = k[:4] if len(k) > 3 else k[[0, 0, 1, 2]]
         return float(fx), float(fy), float(cx), float(cy)
+
+    def _used_corners(self) -> NDArray[np.float64]:
+        return self.observed[np.isfinite(self.residuals[..., 0])]
+
+    def _sensitivity(
+        self, rays: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """D pixel / d turn (..., 2, 3) and d pixel / d intrinsics (..., 2, k)."""
+        _, by_point, by_intrinsics = gradients(self.camera, np.ascontiguousarray(rays))
+        return np.cross(rays[..., None, :], by_point), by_intrinsics
 
     def _rays(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
         """Unit rays, NaN where they do not project back: there the lens model folds."""

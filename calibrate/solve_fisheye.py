@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from chromeball.calibrate.adjust import Estimate, adjust, gradients, residuals, spread
+from chromeball.calibrate.adjust import Estimate, adjust, covariance, residuals
 from chromeball.calibrate.lens_result import (
     LEAST_TILT,
     PARALLEL,
@@ -45,15 +45,13 @@ LEAST_SHARE = 0.4
 FEWEST_CORNERS = 6
 #: The second pose of a board is a rival of the first up to so many times its error.
 RIVAL = 5.0
+UNEXPLAINED = "no lens explains where the corners lie: is the board's size right?"
 
 
 @dataclass(frozen=True)
 class FisheyeLens(Lens):
-    """A lens by our own solver; ``turned`` (k + 3, k + 3) is :class:`adjust.Spread`'s, freed
-    from the unit of a corner's deviation. ``condition`` of the reduced normal equations.
-    """  # noqa: D205
+    """A lens by our own solver; ``condition`` is that of its normal equations."""
 
-    turned: NDArray[np.float64]
     condition: float
 
     @property
@@ -68,20 +66,6 @@ class FisheyeLens(Lens):
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write the ``.cameramodel``."""
         self.camera.write(path)
-
-    def deviation(self, rays: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Standard deviation in pixels, worst direction, of points at infinity; NaN kept.
-
-        A change of the intrinsics shows together with the mean turn w of the boards that it
-        causes: dq = dq/di di + dq/dp (w x p).
-        """
-        _, by_point, by_intrinsics = gradients(self.camera, rays)
-        by_turn = np.cross(rays[..., None, :], by_point)
-        j = np.concatenate([by_intrinsics, by_turn], axis=-1)
-        variance = j @ self.turned @ np.swapaxes(j, -1, -2)
-        # The larger eigenvalue of [[a, b], [b, c]].
-        a, b, c = variance[..., 0, 0], variance[..., 0, 1], variance[..., 1, 1]
-        return np.sqrt((a + c) / 2 + np.hypot((a - c) / 2, b))
 
     def pose_residuals(
         self, corners: NDArray[np.float64], target: Target
@@ -119,6 +103,8 @@ def solve_fisheye(
     # Boards that had no pose, or the wrong one of two, get theirs from the lens as it is now.
     scale = _scale(residuals(estimate, board, corners[placed]))
     placed, estimate = _place(estimate, board, corners, found, scale)
+    if len(placed) < 3:
+        raise UserError(UNEXPLAINED)
     free = np.ones(count + 2, bool)
     estimate = _robust(estimate, board, corners[placed], found[placed], free)
     placed, estimate, used = _settle(placed, estimate, board, corners, found)
@@ -158,7 +144,7 @@ def _start(
         if error < least:
             best, least = (placed, estimate), error
     if best is None:
-        raise UserError("no lens explains where the corners lie: is the board's size right?")
+        raise UserError(UNEXPLAINED)
     return best
 
 
@@ -320,12 +306,12 @@ def _judge(
         raise UserError(PARALLEL)
     error = residuals(estimate, board, corners[placed])
     sigma = _sigma(error[used], estimate)
-    known = spread(
+    spread, condition = covariance(
         estimate, board, corners[placed], used, _precision(estimate.camera, board, sigma)
     )
     count = len(estimate.camera.intrinsics)
-    errors = sigma * np.sqrt(np.diag(known.shared)[:count])
-    check_focal(estimate.camera.intrinsics, errors, 2 if count > 3 else 1)
+    spread = sigma**2 * spread[:count, :count]
+    check_focal(estimate.camera.intrinsics, np.sqrt(np.diag(spread)), 2 if count > 3 else 1)
     left = np.full(corners.shape, np.nan)
     left[placed] = np.where(used[..., None], error, np.nan)
     poses = np.full((len(corners), 6), np.nan)
@@ -337,11 +323,10 @@ def _judge(
         outliers=np.isfinite(corners[..., 0]) & np.isnan(left[..., 0]),
         rms=math.sqrt(float((error[used] ** 2).sum(axis=-1).mean())),
         sigma=sigma,
-        standard_errors=errors,
+        covariance=spread,
         bow=estimate.bow,
         camera_from_board=poses,
-        turned=sigma**2 * known.turned,
-        condition=known.condition,
+        condition=condition,
     )
 
 

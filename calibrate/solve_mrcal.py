@@ -53,17 +53,6 @@ class MrcalLens(Lens):
             return (*OPENCV_NAMES[:4], *(f"s{i}" for i in range(count - 4)))
         return OPENCV_NAMES[:count]
 
-    def deviation(self, rays: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Standard deviation in pixels, worst direction, of points at infinity; NaN kept."""
-        values = solver.projection_uncertainty(
-            np.ascontiguousarray(rays),
-            self.solution,
-            atinfinity=True,
-            what="worstdirection-stdev",
-            observed_pixel_uncertainty=self.sigma,
-        )
-        return np.asarray(values, float)
-
     def pose_residuals(
         self, corners: NDArray[np.float64], target: Target
     ) -> NDArray[np.float64]:
@@ -247,9 +236,9 @@ def _judge(
     if free < 1:
         raise UserError("after outlier rejection too few corners are left: check the pictures")
     sigma = math.sqrt(float(square.sum()) / free)
-    errors = _standard_errors(problem, sigma)
+    covariance = _covariance(problem, sigma)
     intrinsics = problem["intrinsics"][0]
-    check_focal(intrinsics, errors, 2)
+    check_focal(intrinsics, np.sqrt(np.diag(covariance)), 2)
     name = problem["lensmodel"]
     return MrcalLens(
         camera=CameraModel(
@@ -261,7 +250,7 @@ def _judge(
         outliers=found & ~inlier,
         rms=math.sqrt(2 * float(square.mean())),
         sigma=sigma,
-        standard_errors=errors,
+        covariance=covariance,
         bow=np.array(problem["calobject_warp"], float),
         camera_from_board=problem["rt_ref_frame"],
     )
@@ -274,8 +263,8 @@ def _residuals(x: NDArray[np.float64], corners: NDArray[np.float64]) -> NDArray[
     return residuals
 
 
-def _standard_errors(problem: dict[str, Any], sigma: float) -> NDArray[np.float64]:
-    """Of the intrinsics: sigma sqrt diag (J'J)^-1; zero for those held fixed."""
+def _covariance(problem: dict[str, Any], sigma: float) -> NDArray[np.float64]:
+    """Of the intrinsics: sigma^2 (J'J)^-1; zero for those held fixed."""
     states = solver.num_states(**problem)
     count = problem["intrinsics"].shape[1]
     free = solver.num_states_intrinsics(**problem)
@@ -285,9 +274,10 @@ def _standard_errors(problem: dict[str, Any], sigma: float) -> NDArray[np.float6
     first = solver.state_index_intrinsics(0, **problem)
     rows = np.zeros((free, states))
     rows[np.arange(free), first + np.arange(free)] = 1
-    covariance = factorization.solve_xt_JtJ_bt(rows)[:, first : first + free]
+    packed = factorization.solve_xt_JtJ_bt(rows)[:, first : first + free]
     scale = np.ones(states)
     solver.unpack_state(scale, **problem)
-    errors = np.zeros(count)
-    errors[count - free :] = sigma * np.sqrt(np.diag(covariance)) * scale[first : first + free]
-    return errors
+    unit = sigma * scale[first : first + free]
+    covariance = np.zeros((count, count))
+    covariance[count - free :, count - free :] = packed * np.outer(unit, unit)
+    return covariance

@@ -42,10 +42,13 @@ def lens(
         chessboard:9x6:0.025 (inner corners, square in metres) or
         charuco:9x6:0.04:0.03:4X4_50 (squares, square and marker in metres, dictionary).
     model
-        pinhole, opencv4, opencv5, opencv8, splined, or auto: the one of opencv4, opencv5 and
-        opencv8 with the least error on pictures left out of the solution.
+        pinhole, opencv4, opencv5, opencv8, splined; kb4 for fisheyes beyond 180 degrees, too
+        (Kannala and Brandt), equidistant, equisolid, stereographic; or auto: the one of
+        opencv4, opencv5, opencv8 and kb4 with the least error on pictures left out of the
+        solution.
     output
-        The .cameramodel to write, in mrcal's format, with all that the solution was made of.
+        The .cameramodel to write, in mrcal's format; for its models, the first five, with all
+        that the solution was made of.
     json
         Print the figures as JSON.
 

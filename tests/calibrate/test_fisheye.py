@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from chromeball.calibrate.adjust import Estimate, adjust, gradients, spread
+from chromeball.calibrate.adjust import Estimate, adjust, covariance, gradients
 from chromeball.calibrate.detect import detect_files
 from chromeball.calibrate.lens import calibrate_lens, choose_model, held_out_error, pose_errors
 from chromeball.calibrate.solve_mrcal import MrcalLens
@@ -41,11 +41,12 @@ def field() -> NDArray[np.float64]:
 
 
 def aligned(camera: CameraModel, truth: CameraModel) -> NDArray[np.float64]:
-    """Where `camera` sees the field, the best turn taken out, minus where it should."""
-    rays = field()
-    q = truth.project(rays)
-    u, _, vt = np.linalg.svd(camera.unproject(q).T @ rays)
-    return camera.project(rays @ (u @ vt).T) - q
+    """Where `camera` sees the field, minus where it should; the turn that
+    fits best over the corners is taken out.
+    """
+    seen = truth.unproject(project(BOARD, truth, POSES).reshape(-1, 2))
+    u, _, vt = np.linalg.svd(camera.unproject(truth.project(seen)).T @ seen)
+    return camera.project(field() @ (u @ vt).T) - truth.project(field())
 
 
 def scattered(
@@ -108,37 +109,32 @@ def test_agrees_with_mrcal() -> None:
     ours = adjust(start, board, observed, used, free=free, precision=none, steps=60)
     errors = theirs.standard_errors
     assert np.all(np.abs(ours.camera.intrinsics - theirs.camera.intrinsics) < 0.05 * errors)
-    known = spread(ours, board, observed, used, none)
-    ratio = theirs.sigma * np.sqrt(np.diag(known.shared)[:8]) / errors
+    known, _ = covariance(ours, board, observed, used, none)
+    ratio = theirs.sigma * np.sqrt(np.diag(known)[:8]) / errors
     np.testing.assert_allclose(ratio, 1, rtol=0.03)
     np.testing.assert_allclose(ours.bow, theirs.bow, atol=2e-6)
 
 
 def test_truth_and_honest_errors() -> None:
-    """Six noises: the truth within .18 px up to 90 degrees; errors as large as predicted."""
+    """Eight noises: the truth within .18 px up to 90 degrees; errors as large as predicted.
+
+    The intrinsics' chi-square has 64 degrees of freedom: its bounds hold 98 % of cases. The
+    field's errors hang together more, so that theirs are wider.
+    """
     errors: list[NDArray[np.float64]] = []
-    scores: list[NDArray[np.float64]] = []
-    ratios: list[float] = []
-    rays = field()
-    for seed in range(6):
+    scores: list[float] = []
+    predicted = 0.0
+    for seed in range(100, 108):
         lens = calibrate_lens(corners(seed, bow=0.0005), BOARD, SIZE, "kb4")
         assert lens.sigma == pytest.approx(NOISE, rel=0.06)
-        errors.append(aligned(lens.camera, CAMERA))
-        scores.append((lens.camera.intrinsics - TRUTH) / lens.standard_errors)
-        # The boards' mean turn, known here, is what the prediction takes out.
-        found = [Pose.from_rotation_vector(r[:3], r[3:]) for r in lens.camera_from_board]
-        turns = [
-            Pose(f.rotation @ p.rotation.T, np.zeros(3)).rotation_vector()
-            for f, p in zip(found, POSES, strict=True)
-        ]
-        turn = Pose.from_rotation_vector(np.mean(turns, axis=0), np.zeros(3))
-        miss = lens.camera.project(turn.rotate(rays)) - CAMERA.project(rays)
-        ratios.append(float((miss**2).sum() / (2 * lens.deviation(rays) ** 2).sum()))
         assert abs(abs(lens.bow[0]) - 0.0005) < 6e-5
-    assert np.sqrt(np.mean(np.square(errors)) * 2) < 0.18
-    assert np.sqrt(np.mean(np.square(scores))) == pytest.approx(1, abs=0.4)
-    # The worst direction's deviation is between the mean one and root two times it.
-    assert 0.5 < math.sqrt(np.mean(ratios)) < 1.2
+        miss = lens.camera.intrinsics - TRUTH
+        scores.append(float(miss @ np.linalg.solve(lens.covariance, miss)))
+        errors.append(aligned(lens.camera, CAMERA))
+        predicted += float(lens.projection_covariance(field()).trace(axis1=-2, axis2=-1).sum())
+    assert 8 * len(scores) * 0.64 < sum(scores) < 8 * len(scores) * 1.46
+    assert 0.7 < np.sqrt(np.square(errors).sum() / predicted) < 1.3
+    assert np.sqrt(2 * np.mean(np.square(errors))) < 0.18
 
 
 def test_one_parameter_fisheyes() -> None:
@@ -177,8 +173,8 @@ def test_outliers(share: float) -> None:
 def test_misread_views_count_for_nothing() -> None:
     """Two boards with their corners in the wrong order, and a partly hidden one."""
     observed = corners()
-    observed[3] = observed[3].reshape(-1, 2)[np.random.default_rng(1).permutation(54)].reshape(
-        6, 9, 2
+    observed[3] = (
+        observed[3].reshape(-1, 2)[np.random.default_rng(1).permutation(54)].reshape(6, 9, 2)
     )
     observed[8] = observed[8, :, ::-1].swapaxes(0, 1).reshape(6, 9, 2)
     observed[5, :, 5:] = np.nan
@@ -207,9 +203,9 @@ def test_refusals() -> None:
     with pytest.raises(UserError, match=r"no lens explains|fit one lens|focal length open"):
         calibrate_lens(noise_alone, BOARD, SIZE, "kb4")
     few = corners()[:3]
-    few[:, 2:], few[:, :, 5:] = np.nan, np.nan
-    with pytest.raises(UserError, match="few for kb4"):
-        calibrate_lens(few[:, :, :], BOARD, SIZE, "kb4")
+    few[:, 2:], few[:, :, 4:] = np.nan, np.nan
+    with pytest.raises(UserError, match="24 corners are too few for kb4"):
+        calibrate_lens(few, BOARD, SIZE, "kb4")
 
 
 def test_auto_finds_the_fisheye() -> None:
@@ -248,6 +244,7 @@ def test_real_sets(folder: str, board: Chessboard, bar: float) -> None:
 
 def test_held_out_error_of_the_wrong_lens_is_larger() -> None:
     right, wrong = (
-        held_out_error(corners()[:12], BOARD, SIZE, model, folds=2) for model in ("kb4", "equisolid")
+        held_out_error(corners()[:12], BOARD, SIZE, model, folds=2)
+        for model in ("kb4", "equisolid")
     )
     assert wrong > 3 * right

@@ -48,24 +48,27 @@ def test_standard_errors_are_honest() -> None:
 
 
 def test_projection_uncertainty_is_honest() -> None:
-    """Spread of projections of solved cameras against the map, in the middle of the picture.
+    """Spread of projections of solved cameras against the prediction, in the middle.
 
     A turn of all boards and the camera together shows in no picture, so that the best turn is
     taken out of each solution first, as the definition of the uncertainty does.
     """
     x, y = np.meshgrid(np.linspace(160, 480, 5), np.linspace(120, 360, 5))
     q = np.stack([x.ravel(), y.ravel()], axis=-1)
-    rays = CAMERA.unproject(q)
-    misses: list[NDArray[np.float64]] = []
-    predicted = 0.0
-    for seed in range(8):
+    seen = corners().reshape(-1, 2)
+    rays, corner_rays = CAMERA.unproject(q), CAMERA.unproject(seen)
+    ratios: list[float] = []
+    for seed in range(12):
         lens = calibrate_lens(corners(seed=seed), BOARD, SIZE, "opencv4")
-        u, _, vt = np.linalg.svd(lens.camera.unproject(q).T @ rays)
-        misses.append(lens.camera.project(rays @ (u @ vt).T) - q)
-        predicted = float(np.median(lens.uncertainty()[1][8:15, 10:20]))
-    # The worst direction's deviation lies between the root mean square and root two times it.
-    measured = float(np.sqrt(np.mean(np.square(misses))))
-    assert 0.4 * predicted < measured < 1.1 * predicted
+        u, _, vt = np.linalg.svd(lens.camera.unproject(seen).T @ corner_rays)
+        miss = lens.camera.project(rays @ (u @ vt).T) - q
+        predicted = lens.projection_covariance(rays)
+        ratios.append(float((miss**2).sum() / predicted.trace(axis1=-2, axis2=-1).sum()))
+    assert 0.8 < np.sqrt(np.mean(ratios)) < 1.2
+    lens = calibrate_lens(corners(), BOARD, SIZE, "opencv4")
+    pixels, worst = lens.uncertainty(columns=7)
+    variance = lens.projection_covariance(lens.camera.unproject(pixels))
+    np.testing.assert_allclose(worst, np.sqrt(np.linalg.eigvalsh(variance)[..., 1]))
 
 
 def test_bow_and_field_of_view() -> None:

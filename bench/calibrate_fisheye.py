@@ -1,0 +1,137 @@
+"""Fisheye lenses beside OpenCV's and mrcal's models, on one set of corners and no focal guess."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.row import Row
+from chromeball.calibrate.detect import detect_files
+from chromeball.calibrate.lens import calibrate_lens, pose_errors
+from chromeball.calibrate.solve_fisheye import FisheyeLens
+from chromeball.calibrate.target import Chessboard
+from chromeball.calibrate.virtual import project, surrounding_poses
+from chromeball.scene.camera import CameraModel
+from chromeball.scene.errors import UserError
+
+DATA = Path(__file__).resolve().parents[1].parent / "shared/data/calibrate/camodocal"
+BOARD = Chessboard(9, 6, 0.08)
+FOLDS = 4
+TRUTH = np.array([290.0, 291, 655, 470, -0.02, 0.01, -0.004, 0.0006])
+
+type Corners = NDArray[np.float64]
+#: Corners and size -> a lens, and a lens and left-out corners -> RMS of each view.
+type Peer = tuple[Callable[[Corners, tuple[int, int]], Any], Callable[[Any, Corners], Corners]]
+
+
+def rows(quick: bool) -> list[Row]:
+    """Truth error of a virtual lens of 190 degrees, and real pictures left out of the solution."""
+    return [*_virtual(2 if quick else 6), *(_camodocal() if DATA.is_dir() else [])]
+
+
+def _virtual(seeds: int) -> list[Row]:
+    """RMS in the field up to 95 degrees, the best turn taken out."""
+    camera = CameraModel("kb4", TRUTH, (1280, 960), max_angle=math.radians(95))
+    poses = surrounding_poses(BOARD, camera, 20, seed=1)
+    pixels = camera.pixel_grid()[::40, ::40].reshape(-1, 2)
+    rays = camera.unproject(pixels)
+    pixels, rays = pixels[np.isfinite(rays[:, 0])], rays[np.isfinite(rays[:, 0])]
+    what = f"virtual fisheye of 190 degrees, noise 0.2 px, {seeds} seeds, RMS from the truth"
+    found: list[Row] = []
+    for name in ("kb4", "opencv8", "splined"):
+        seconds, errors = math.inf, list[float]()
+        for seed in range(seeds):
+            corners = project(BOARD, camera, poses, noise=0.2, seed=seed)
+            start = time.process_time()
+            try:
+                lens = calibrate_lens(corners, BOARD, camera.size, name)
+            except UserError:
+                continue
+            seconds = min(seconds, time.process_time() - start)
+            seen = lens.camera.unproject(pixels)
+            reached = np.isfinite(seen).all(axis=1)
+            u, _, vt = np.linalg.svd(seen[reached].T @ rays[reached])
+            miss = lens.camera.project(rays @ (u @ vt).T) - pixels
+            errors.append(float(np.sqrt((miss**2).sum(axis=1).mean())))
+        tool = "chromeball kb4" if name == "kb4" else f"mrcal {name}, our start"
+        error = float(np.mean(errors)) if errors else math.nan
+        found.append(
+            Row("calibrate", what, tool, seconds if errors else math.nan, error, "px",
+                f"{len(errors)} of {seeds} solved; NaN: does not reach the field")
+        )  # fmt: skip
+    return found
+
+
+def _camodocal() -> list[Row]:
+    """Held-out RMS per corner, poses of left-out views alone fitted; all from our corners."""
+    detections = [d for d in detect_files(sorted(DATA.glob("*.png")), BOARD) if d.usable]
+    corners, size = np.array([d.corners for d in detections]), detections[0].size
+    cv: Any = cv2
+    skew, checked = cv.CALIB_FIX_SKEW, cv.CALIB_FIX_SKEW | cv.CALIB_CHECK_COND
+    peers: dict[str, Peer] = {
+        "chromeball kb4": (_ours("kb4"), _our_errors),
+        "mrcal opencv8, our start": (_ours("opencv8"), _our_errors),
+        "mrcal splined, our start": (_ours("splined"), _our_errors),
+        "cv2.fisheye": (_opencv(skew), _opencv_errors),
+        "cv2.fisheye, CHECK_COND": (_opencv(checked), _opencv_errors),
+    }
+    what = f"camodocal, {len(corners)} real pictures of 185 degrees, held-out RMS per corner"
+    found: list[Row] = []
+    for tool, (solve, judge) in peers.items():
+        start, note = time.process_time(), "no focal guess"
+        try:
+            solve(corners, size)
+            seconds, errors = time.process_time() - start, list[float]()
+            for fold in range(FOLDS):
+                out = np.arange(len(corners)) % FOLDS == fold
+                errors.extend(judge(solve(corners[~out], size), corners[out]).tolist())
+            error = float(np.sqrt(np.mean(np.square(errors))))
+            lost = int(np.isinf(errors).sum())
+            note += f"; no pose for {lost} of {len(errors)} views" if lost else ""
+        except (cv2.error, UserError):
+            seconds, error, note = time.process_time() - start, math.nan, f"{note}: fails"
+        found.append(Row("calibrate", what, tool, seconds, error, "px", note))
+    return found
+
+
+def _ours(model: str) -> Callable[[Corners, tuple[int, int]], Any]:
+    return lambda corners, size: calibrate_lens(corners, BOARD, size, model)
+
+
+def _our_errors(lens: Any, corners: Corners) -> Corners:
+    return pose_errors(lens, corners, BOARD)
+
+
+def _opencv(flags: int) -> Callable[[Corners, tuple[int, int]], Any]:
+    fisheye: Any = cv2.fisheye
+
+    def solve(corners: Corners, size: tuple[int, int]) -> Any:
+        points = BOARD.points().reshape(1, -1, 3)
+        views = [view.reshape(1, -1, 2) for view in corners]
+        _, matrix, k, _, _ = fisheye.calibrate(
+            [points] * len(views), views, size, np.zeros((3, 3)), np.zeros(4), flags=flags
+        )
+        return matrix, k
+
+    return solve
+
+
+def _opencv_errors(lens: Any, corners: Corners) -> Corners:
+    """Its lens with our poses: the formula is the same, ours goes beyond 90 degrees."""
+    matrix, k = lens
+    core = [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]]
+    camera = CameraModel("kb4", np.array([*core, *np.ravel(k)]), (1280, 960))
+    nothing = np.zeros((8, 8))
+    empty = np.zeros((0, BOARD.rows, BOARD.columns, 2))
+    lens = FisheyeLens(
+        camera, empty, empty, empty[..., 0] > 0, 0.0, 1.0, nothing, np.zeros(2),
+        np.zeros((0, 6)), 1.0,
+    )  # fmt: skip
+    return pose_errors(lens, corners, BOARD)
