@@ -1,4 +1,4 @@
-"""Fisheye lenses beside OpenCV's and mrcal's models, on one set of corners and no focal guess."""
+"""Fisheyes beside OpenCV's and mrcal's models, on the same corners, with no focal guess."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ type Peer = tuple[Callable[[Corners, tuple[int, int]], Any], Callable[[Any, Corn
 
 
 def rows(quick: bool) -> list[Row]:
-    """Truth error of a virtual lens of 190 degrees, and real pictures left out of the solution."""
+    """Truth error of a virtual lens of 190 degrees, and real pictures left out."""
     return [*_virtual(2 if quick else 6), *(_camodocal() if DATA.is_dir() else [])]
 
 
@@ -92,8 +92,9 @@ def _camodocal() -> list[Row]:
             for fold in range(FOLDS):
                 out = np.arange(len(corners)) % FOLDS == fold
                 errors.extend(judge(solve(corners[~out], size), corners[out]).tolist())
-            error = float(np.sqrt(np.mean(np.square(errors))))
-            lost = int(np.isinf(errors).sum())
+            posed = np.array(errors)[np.isfinite(errors)]
+            error = float(np.sqrt(np.mean(posed**2))) if len(posed) else math.nan
+            lost = len(errors) - len(posed)
             note += f"; no pose for {lost} of {len(errors)} views" if lost else ""
         except (cv2.error, UserError):
             seconds, error, note = time.process_time() - start, math.nan, f"{note}: fails"

@@ -238,7 +238,8 @@ def _judge(
     sigma = math.sqrt(float(square.sum()) / free)
     covariance = _covariance(problem, sigma)
     intrinsics = problem["intrinsics"][0]
-    check_focal(intrinsics, np.sqrt(np.diag(covariance)), 2)
+    with np.errstate(invalid="ignore"):  # a variance below zero is refused as NaN
+        check_focal(intrinsics, np.sqrt(np.diag(covariance)), 2)
     name = problem["lensmodel"]
     return MrcalLens(
         camera=CameraModel(
