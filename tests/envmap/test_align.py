@@ -109,7 +109,7 @@ def test_perspective_camera() -> None:
 
 @pytest.mark.parametrize(
     ("camera", "height", "width", "depth"),
-    [(PANORAMA, 1.5, 1.0, 0.6), (LENS, 1.2, 1.0, 0.8)],
+    [(PANORAMA, 1.5, 1.0, 0.6), (LENS, 1.2, 1.0, 0.8), (PANORAMA, 1.5, 3.0, 2.0)],
 )
 def test_click_noise_has_the_predicted_covariance(
     camera: CameraModel, height: float, width: float, depth: float

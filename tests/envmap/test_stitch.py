@@ -249,8 +249,8 @@ def test_untracked_frames_stand_upright(yaws: tuple[int, ...], pitch: int, roll:
     )
     anyhow = exp(np.array([0.4, -1.0, 2.0]))
     up = (level(anyhow @ held) @ anyhow @ held @ np.swapaxes(held, 1, 2))[:, 1, 1]
-    # tilt cannot be told from up where all look one way
-    limit = 3 if max(yaws) > 9 else 3 + abs(pitch)
+    # two frames 45 degrees apart make .5 of roll 1.3; one way, up is not told from tilted
+    limit = {8: 1, 2: 3}.get(len(yaws), 3 + abs(pitch))
     assert np.degrees(np.arccos(np.clip(up, -1, 1))).max() < limit
 
 

@@ -138,6 +138,7 @@ def test_floor_polygon_box_and_room(tmp_path: Path, env: Path) -> None:
         ),
         (["box", "--corners", "0,0 1,1 1,0"], "a box needs height"),
         (["box", "--corners", "0,0 1,1 1,0", "--height", "0"], "must be positive and finite"),
+        (["box", "--corners", "0,0 1,1 1,0", "--height", "-1"], "must be positive and finite"),
         (["room", "--corners", "0,0 1,1 1,0", "--height", "-2"], "--height -2: it must be"),
         (["build", "empty.toml"], r"empty.toml: there is no \[\[stand_in\]\]"),
         (["build", "wrong.toml"], "wrong.toml: unknown key 'heigth' .*did you mean 'height'"),
