@@ -4,7 +4,8 @@ A chessboard is found whole: the classic detector, the sector-based one where th
 ChArUco board any part is enough; corners whose markers were not read are predicted from their
 neighbours and kept if the picture shows the board there. A chessboard's corners are refined by
 Foerstner's gradient method in a window scaled to the local pitch, a ChArUco board's by fitting
-the rendered board (:mod:`chromeball.calibrate.patch`).
+the rendered board (:mod:`chromeball.calibrate.patch`), circles by their centroids
+(:mod:`chromeball.calibrate.circles`).
 """
 
 from __future__ import annotations
@@ -19,8 +20,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from chromeball.calibrate.circles import detect_circles
 from chromeball.calibrate.patch import BLURS, LEAST_CORRELATION, Board, fit_corner
-from chromeball.calibrate.target import Charuco, Chessboard, Target
+from chromeball.calibrate.target import Charuco, Chessboard, CircleGrid, Target
 from chromeball.scene.errors import UserError
 from chromeball.scene.image import Image, read_image, to_display
 
@@ -99,7 +101,7 @@ def judge(file: Path, picture: NDArray[np.uint8], target: Target) -> Detection:
     found = np.argwhere(np.isfinite(corners[..., 0]))
     if not len(found):
         return Detection(file, size, corners, float("nan"), False, "no board")
-    verdict = f"{len(found)} of {target.rows * target.columns} corners, blur {blur:.1f} px"
+    verdict = f"{len(found)} of {target.count} corners, blur {blur:.1f} px"
     spread = np.linalg.matrix_rank(found - found.mean(axis=0)) if len(found) > 1 else 0
     if len(found) < FEWEST or spread < 2:
         reason = "too few" if len(found) < FEWEST else "all in a line"
@@ -135,6 +137,8 @@ def detect_with_blur(
         return np.full((target.rows, target.columns, 2), np.nan), np.nan
     if isinstance(target, Charuco):
         return _detect_charuco(picture, target)
+    if isinstance(target, CircleGrid):
+        return detect_circles(picture, target)
     corners = _detect_chessboard(picture, target)
     return corners, _edge_blur(picture, corners)
 

@@ -2,11 +2,13 @@
 
 A target's corners form a grid of shape (rows, columns) in metres: x along a row, y down the
 columns as the board is looked at, z = 0, the first inner corner of the upper left at the
-origin. That is the board mrcal knows.
+origin. That is the board mrcal knows. An asymmetric grid of circles has a circle at every second
+place of such a grid.
 """
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import dataclass
 from fractions import Fraction
@@ -18,7 +20,10 @@ from numpy.typing import NDArray
 
 from chromeball.scene.errors import UserError
 
-FORMS = "chessboard:9x6:0.025 or charuco:9x6:0.04:0.03:4X4_50"
+FORMS = (
+    "chessboard:9x6:0.025, charuco:9x6:0.04:0.03:4X4_50, circles:7x5:0.04 or "
+    "acircles:4x11:0.02"
+)
 
 
 @dataclass(frozen=True)
@@ -37,6 +42,11 @@ class Chessboard:
     def points(self) -> NDArray[np.float64]:
         """Corners on the board, (rows, columns, 3), metres."""
         return _grid(self.rows, self.columns, self.square)
+
+    @property
+    def count(self) -> int:
+        """How many corners there are."""
+        return self.rows * self.columns
 
     def cells(self) -> NDArray[np.uint8]:
         """The board itself, one cell a square, (rows + 1, columns + 1), 0 black, 255 white."""
@@ -84,6 +94,11 @@ class Charuco:
     def points(self) -> NDArray[np.float64]:
         """Corners on the board, (rows, columns, 3), metres."""
         return _grid(self.rows, self.columns, self.square)
+
+    @property
+    def count(self) -> int:
+        """How many corners there are."""
+        return self.rows * self.columns
 
     def board(self) -> Any:
         """The same board for OpenCV's detector."""
@@ -133,14 +148,85 @@ class Charuco:
         return int(self.board().getDictionary().markerSize) + 2
 
 
-type Target = Chessboard | Charuco
+@dataclass(frozen=True)
+class CircleGrid:
+    """Dark discs on white paper, ``across`` x ``down`` of them; ``square`` in metres.
+
+    On a symmetric grid ``square`` is the distance of neighbours. On an asymmetric one, as
+    OpenCV counts it, every second row is shifted by ``square``, rows are ``square`` apart and
+    the discs of a row twice that. Half a turn changes neither a symmetric grid nor an
+    asymmetric one with an even number of rows; for a single lens that does not matter.
+    """
+
+    across: int
+    down: int
+    square: float
+    asymmetric: bool = False
+
+    @property
+    def columns(self) -> int:
+        """Places in a row, with or without a disc."""
+        return self.across * (2 if self.asymmetric else 1)
+
+    @property
+    def rows(self) -> int:
+        """Places in a column."""
+        return self.down
+
+    @property
+    def count(self) -> int:
+        """How many discs there are."""
+        return self.across * self.down
+
+    @property
+    def pitch(self) -> float:
+        """Distance of nearest discs in units of ``square``."""
+        return math.sqrt(2) if self.asymmetric else 1.0
+
+    @property
+    def spec(self) -> str:
+        """As a person types it."""
+        kind = "acircles" if self.asymmetric else "circles"
+        return f"{kind}:{self.across}x{self.down}:{self.square!r}"
+
+    def points(self) -> NDArray[np.float64]:
+        """Places on the board, (rows, columns, 3), metres."""
+        return _grid(self.rows, self.columns, self.square)
+
+    def places(self) -> NDArray[np.int_]:
+        """Column and row of each disc in :meth:`points`, row by row, (count, 2)."""
+        y, x = np.indices((self.down, self.across))
+        column = 2 * x + y % 2 if self.asymmetric else x
+        return np.stack([column, y], axis=-1).reshape(-1, 2)
+
+    @property
+    def cells_per_square(self) -> int:
+        """How many cells of :meth:`cells` a square is wide."""
+        return 64
+
+    def cells(self) -> NDArray[np.uint8]:
+        """The board drawn, discs half as wide as their distance, 0 black, 255 white.
+
+        ((rows + 1) * n, (columns + 1) * n) with n = :attr:`cells_per_square`.
+        """
+        n = self.cells_per_square
+        grid = np.full(((self.rows + 1) * n, (self.columns + 1) * n), 255, np.uint8)
+        radius = 0.25 * self.pitch * n
+        y, x = np.indices((2 * n, 2 * n)) + 0.5 - n
+        disc = np.hypot(x, y) < radius
+        for column, row in self.places().tolist():
+            grid[row * n : (row + 2) * n, column * n : (column + 2) * n][disc] = 0
+        return grid
+
+
+type Target = Chessboard | Charuco | CircleGrid
 
 
 def parse_target(spec: str) -> Target:
-    """Read ``chessboard:9x6:0.025`` or ``charuco:9x6:0.04:0.03:4X4_50``.
+    """Read ``chessboard:9x6:0.025``, ``charuco:9x6:0.04:0.03:4X4_50``, ``circles:7x5:0.04``.
 
     A chessboard is counted in inner corners, a ChArUco board in squares, across x down; sizes
-    are metres.
+    are metres. ``acircles:4x11:0.02`` is OpenCV's asymmetric grid of circles.
 
     Raises
     ------
@@ -164,6 +250,12 @@ def parse_target(spec: str) -> Target:
                 raise UserError(f"{spec}: the marker must be smaller than its square")
             name = _dictionary(spec, dictionary, across * down // 2)
             return Charuco(across, down, side, inner, name)
+        case ("circles" | "acircles"), [count, spacing]:
+            across, down = _count(spec, count)
+            least = 2 if kind == "acircles" else 3
+            if across < least or down < 3:
+                raise UserError(f"{spec}: a grid of circles needs {least}x3 or more")
+            return CircleGrid(across, down, _length(spec, spacing), kind == "acircles")
         case _:
             raise UserError(f"{spec!r} is no target; write {FORMS}")
 
