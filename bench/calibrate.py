@@ -14,7 +14,7 @@ from bench import calibrate_fisheye
 from bench.row import Row
 from chromeball.calibrate.detect import detect
 from chromeball.calibrate.lens import calibrate_lens, pose_errors
-from chromeball.calibrate.target import Charuco, Chessboard
+from chromeball.calibrate.target import Charuco, Chessboard, CircleGrid
 from chromeball.calibrate.virtual import board_poses, photograph, project
 from chromeball.scene.camera import CameraModel
 
@@ -25,8 +25,10 @@ FOLDS = 4
 
 def rows(quick: bool) -> list[Row]:
     """CPU seconds and errors of ours and of OpenCV's, interleaved."""
+    count = 2 if quick else 8
     return [
-        *_charuco(2 if quick else 8),
+        *_charuco(count),
+        *_circles(count),
         *(_left() if DATA.is_dir() else []),
         *calibrate_fisheye.rows(quick),
     ]
@@ -119,3 +121,37 @@ def _charuco(count: int) -> list[Row]:
         what = f"corners of {count} ChArUco pictures 640x480, blur 2 px"
         rows.append(Row("calibrate", what, tool, cpu, error, "px", f"{share:.0%} found"))
     return rows
+
+
+def _circles(count: int) -> list[Row]:
+    """Centres of an asymmetric grid of circles whose places are known."""
+    values = np.array([520.0, 523, 331, 228, -0.24, 0.09, 0.001, -0.0008])
+    camera = CameraModel("LENSMODEL_OPENCV4", values, (640, 480))
+    board = CircleGrid(4, 11, 0.02, asymmetric=True)
+    poses = board_poses(board, camera, count, seed=3, size=0.75)
+    truth = project(board, camera, poses)
+    column, row = board.places().T
+    pictures = [photograph(board, camera, p, blur=1.0, seed=i) for i, p in enumerate(poses)]
+    cv: Any = cv2
+    seconds, found = [0.0, 0.0], np.full((2, *truth.shape), np.nan)
+    for i, picture in enumerate(pictures):
+        start = time.process_time()
+        found[0, i] = detect(picture, board)
+        seconds[0] += time.process_time() - start
+        start = time.process_time()
+        seen, centres = cv.findCirclesGrid(
+            picture, (board.across, board.down), flags=cv.CALIB_CB_ASYMMETRIC_GRID
+        )
+        seconds[1] += time.process_time() - start
+        if seen:
+            found[1, i, row, column] = centres.reshape(-1, 2)
+    square = ((found - truth) ** 2).sum(axis=-1)[:, :, row, column]
+    what = f"circles of {count} asymmetric grids 640x480, blur 1 px"
+    return [
+        Row("calibrate", what, tool, cpu, float(np.sqrt(np.nanmean(errors))), "px",
+            f"{np.isfinite(errors).mean():.0%} found")
+        for tool, cpu, errors in zip(
+            ("chromeball", "cv2.findCirclesGrid"), seconds, square, strict=True
+        )
+        if np.isfinite(errors).any()
+    ]  # fmt: skip

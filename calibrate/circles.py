@@ -20,6 +20,10 @@ from chromeball.calibrate.target import CircleGrid
 SEARCH_WIDTH = 1600
 #: Least contrast of disc and paper, codes.
 LEAST_CONTRAST = 12.0
+#: Most blobs to search for a grid, for each of its circles.
+MOST_BLOBS = 6
+#: How far a disc's radius may be from the board's, relative.
+SAME_SIZE = 0.2
 
 
 def detect_circles(
@@ -27,8 +31,8 @@ def detect_circles(
 ) -> tuple[NDArray[np.float64], float]:
     """Centres (rows, columns, 2) in pixels, NaN where the grid has none, and the edges' blur.
 
-    All of a grid must be in the picture: a part of it could be any part. Without a grid
-    everything is NaN.
+    All of a grid must be in the picture: a part of it could be any part. Single discs are left
+    out where they cannot be measured, at the picture's border or half in shadow.
     """
     grid = np.full((target.rows, target.columns, 2), np.nan)
     places = target.places()
@@ -38,13 +42,18 @@ def detect_circles(
     for _ in range(2):  # the second time in windows about the first time's centres
         homographies = [_local(places, centres, i) for i in range(len(places))]
         measured = [_centroid(picture, h, target.pitch) for h in homographies]
-        if not all(np.isfinite(c).all() and 0 < r < 0.5 * target.pitch for c, r, _ in measured):
+        radii = np.array([r for _, r, _ in measured])
+        seen = (radii > 0) & (radii < 0.5 * target.pitch)
+        if seen.sum() < target.count / 2:
             return grid, np.nan
-        radius = float(np.median([r for _, r, _ in measured]))
+        radius = float(np.median(radii[seen]))
+        # Discs of one board are of one size; one half hidden or in a shadow's edge is not.
+        seen &= np.abs(radii / radius - 1) < SAME_SIZE
         bias = np.array([_bias(h, radius) for h in homographies])
-        centres = np.array([c for c, _, _ in measured]) - bias
-    grid[places[:, 1], places[:, 0]] = centres
-    return grid, float(np.median([blur for _, _, blur in measured]))
+        centres[seen] = (np.array([c for c, _, _ in measured]) - bias)[seen]
+    column, row = places[seen].T
+    grid[row, column] = centres[seen]
+    return grid, float(np.nanmedian([blur for _, _, blur in measured]))
 
 
 def _find(picture: NDArray[np.uint8], target: CircleGrid) -> NDArray[np.float64] | None:
@@ -56,6 +65,9 @@ def _find(picture: NDArray[np.uint8], target: CircleGrid) -> NDArray[np.float64]
     for factor in [1.0] if width <= SEARCH_WIDTH else [SEARCH_WIDTH / width, 1.0]:
         small = cv.resize(picture, None, fx=factor, fy=factor, interpolation=cv.INTER_AREA)
         blobs = _blobs(small.size / (2 * target.count))
+        # The search grows fast with the blobs, and where they swarm there is no grid to see.
+        if not target.count <= len(blobs.detect(small)) <= MOST_BLOBS * target.count:
+            continue
         for flags in (kind, kind | cv.CALIB_CB_CLUSTERING):
             found, centres = cv.findCirclesGrid(small, count, flags=flags, blobDetector=blobs)
             if found:
@@ -126,7 +138,8 @@ def _centroid(
     pixels = np.stack([x, y], axis=-1)
     steps = np.linalg.norm(_apply(np.linalg.inv(h), pixels.reshape(-1, 2)), axis=-1)
     distance = steps.reshape(x.shape)
-    codes = picture[int(low[1]) : int(high[1]) + 1, int(low[0]) : int(high[0]) + 1].astype(float)
+    (left, top), (right, bottom) = low.astype(int).tolist(), high.astype(int).tolist()
+    codes = picture[top : bottom + 1, left : right + 1].astype(float)
     # The paper's shade is a plane through the window's outermost ring.
     paper = (distance > 0.88 * reach) & (distance <= reach)
     inside = distance <= reach

@@ -2,8 +2,8 @@
 
 A target's corners form a grid of shape (rows, columns) in metres: x along a row, y down the
 columns as the board is looked at, z = 0, the first inner corner of the upper left at the
-origin. That is the board mrcal knows. An asymmetric grid of circles has a circle at every second
-place of such a grid.
+origin. That is the board mrcal knows. An asymmetric grid of circles has a circle at every
+second place of such a grid.
 """
 
 from __future__ import annotations
@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 from chromeball.scene.errors import UserError
 
 FORMS = (
-    "chessboard:9x6:0.025, charuco:9x6:0.04:0.03:4X4_50, circles:7x5:0.04 or "
-    "acircles:4x11:0.02"
+    "chessboard:9x6:0.025, charuco:9x6:0.04:0.03:4X4_50, circles:7x5:0.04 or acircles:4x11:0.02"
 )
 
 
@@ -250,7 +249,7 @@ def parse_target(spec: str) -> Target:
                 raise UserError(f"{spec}: the marker must be smaller than its square")
             name = _dictionary(spec, dictionary, across * down // 2)
             return Charuco(across, down, side, inner, name)
-        case ("circles" | "acircles"), [count, spacing]:
+        case (("circles" | "acircles"), [count, spacing]):
             across, down = _count(spec, count)
             least = 2 if kind == "acircles" else 3
             if across < least or down < 3:

@@ -39,8 +39,11 @@ def lens(
     images
         Photographs of the target, all of one size, focus and zoom untouched.
     target
-        chessboard:9x6:0.025 (inner corners, square in metres) or
-        charuco:9x6:0.04:0.03:4X4_50 (squares, square and marker in metres, dictionary).
+        chessboard:9x6:0.025 (inner corners, square in metres),
+        charuco:9x6:0.04:0.03:4X4_50 (squares, square and marker in metres, dictionary),
+        circles:7x5:0.04 (dark discs, distance of their centres in metres) or
+        acircles:4x11:0.02 (every second row shifted by 0.02; rows that far apart, discs in a
+        row twice as far).
     model
         pinhole, opencv4, opencv5, opencv8, splined; kb4 for fisheyes beyond 180 degrees, too
         (Kannala and Brandt), equidistant, equisolid, stereographic; or auto: the one of

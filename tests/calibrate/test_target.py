@@ -27,7 +27,7 @@ def test_parse() -> None:
     [
         ("", "is no target"),
         ("chessboard:9x6", "is no target"),
-        ("circles:9x6:0.1", "is no target"),
+        ("rings:9x6:0.1", "is no target"),
         ("chessboard:9by6:0.025", "is no count"),
         ("chessboard:2x6:0.025", "3x3 inner corners"),
         ("chessboard:9x6:wide", "no length in metres"),
@@ -42,7 +42,7 @@ def test_bad_specification(spec: str, message: str) -> None:
         parse_target(spec)
 
 
-@given(st.text(max_size=40) | st.from_regex(r"(chessboard|charuco):\w+:[\w.:]*"))
+@given(st.text(max_size=40) | st.from_regex(r"(chessboard|charuco|a?circles):\w+:[\w.:]*"))
 def test_fuzzed_specification(spec: str) -> None:
     try:
         target = parse_target(spec)
