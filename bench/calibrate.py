@@ -128,7 +128,7 @@ def _circles(count: int) -> list[Row]:
     values = np.array([520.0, 523, 331, 228, -0.24, 0.09, 0.001, -0.0008])
     camera = CameraModel("LENSMODEL_OPENCV4", values, (640, 480))
     board = CircleGrid(4, 11, 0.02, asymmetric=True)
-    poses = board_poses(board, camera, count, seed=3, size=0.75)
+    poses = board_poses(board, camera, count, seed=3, size=0.5)
     truth = project(board, camera, poses)
     column, row = board.places().T
     pictures = [photograph(board, camera, p, blur=1.0, seed=i) for i, p in enumerate(poses)]

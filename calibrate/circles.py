@@ -39,21 +39,35 @@ def detect_circles(
     centres = _find(picture, target)
     if centres is None:
         return grid, np.nan
-    for _ in range(2):  # the second time in windows about the first time's centres
-        homographies = [_local(places, centres, i) for i in range(len(places))]
-        measured = [_centroid(picture, h, target.pitch) for h in homographies]
-        radii = np.array([r for _, r, _ in measured])
-        seen = (radii > 0) & (radii < 0.5 * target.pitch)
-        if seen.sum() < target.count / 2:
-            return grid, np.nan
-        radius = float(np.median(radii[seen]))
-        # Discs of one board are of one size; one half hidden or in a shadow's edge is not.
-        seen &= np.abs(radii / radius - 1) < SAME_SIZE
-        bias = np.array([_bias(h, radius) for h in homographies])
-        centres[seen] = (np.array([c for c, _, _ in measured]) - bias)[seen]
+    rough = _measure(picture, centres, target)
+    # The second time in windows about the first time's centres.
+    fine = None if rough is None else _measure(picture, rough[0], target)
+    if fine is None:
+        return grid, np.nan
+    centres, seen, blur = fine
     column, row = places[seen].T
     grid[row, column] = centres[seen]
-    return grid, float(np.nanmedian([blur for _, _, blur in measured]))
+    return grid, blur
+
+
+def _measure(
+    picture: NDArray[np.uint8], centres: NDArray[np.float64], target: CircleGrid
+) -> tuple[NDArray[np.float64], NDArray[np.bool_], float] | None:
+    """Better `centres` (N, 2), which of them were measured, the edges' blur; None if few."""
+    places = target.places()
+    homographies = [_local(places, centres, i) for i in range(len(places))]
+    measured = [_centroid(picture, h, target.pitch) for h in homographies]
+    radii = np.array([r for _, r, _ in measured])
+    seen = (radii > 0) & (radii < 0.5 * target.pitch)
+    if seen.sum() < target.count / 2:
+        return None
+    radius = float(np.median(radii[seen]))
+    # Discs of one board are of one size; one half hidden or in a shadow's edge is not.
+    seen &= np.abs(radii / radius - 1) < SAME_SIZE
+    bias = np.array([_bias(h, radius) for h in homographies])
+    better = np.array([c for c, _, _ in measured]) - bias
+    blur = float(np.nanmedian([b for _, _, b in measured]))
+    return np.where(seen[:, None], better, centres), seen, blur
 
 
 def _find(picture: NDArray[np.uint8], target: CircleGrid) -> NDArray[np.float64] | None:
