@@ -1,0 +1,11 @@
+"""``chromeball calibrate``: lenses, poses, undistorted pictures."""
+
+from cyclopts import App
+
+from chromeball.cli.calibrate.lens import lens
+from chromeball.cli.calibrate.pose import pose
+from chromeball.cli.calibrate.undistort import undistort
+
+app = App(name="calibrate", help="Cameras and their poses.")
+for _command in (lens, pose, undistort):
+    app.command(_command)

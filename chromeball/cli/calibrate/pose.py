@@ -1,0 +1,105 @@
+"""``chromeball calibrate pose``: where a calibrated camera stood."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+from chromeball.cli.calibrate.arguments import Json, Out, print_figures, say
+from chromeball.scene.errors import UserError
+from chromeball.scene.record import Stage, read_json
+
+
+def pose(
+    *,
+    camera: Path,
+    points: str,
+    align: Path,
+    output: Out,
+    sigma: float = 0.5,
+    json: Json = False,
+) -> None:
+    """Find where a calibrated camera stood from the clicked corners of the align rectangle.
+
+    Parameters
+    ----------
+    camera
+        The lens, a .cameramodel.
+    points
+        Pixels of the corners in the order of align.json: "x,y x,y x,y x,y".
+    align
+        align.json of `envmap align`; its corners are the world points.
+    output
+        The posed .cameramodel to write.
+    sigma
+        Standard deviation of a click in pixels, for the standard errors.
+    json
+        Print the figures as JSON.
+
+    """
+    from chromeball.calibrate.pose import solve_pose
+    from chromeball.scene.camera import CameraModel
+
+    if not 0 < sigma < 1e3:
+        raise UserError(f"--sigma {sigma:g}: a click's error in pixels is positive")
+    pixels = _points(points)
+    corners = _corners(align)
+    if len(pixels) != len(corners):
+        raise UserError(f"{len(pixels)} points were given, {align} has {len(corners)} corners")
+    unposed = CameraModel.read(camera)
+    options = {"camera": camera, "points": points, "align": align, "sigma": sigma}
+    with Stage("calibrate pose", [camera, align], **options) as stage:
+        found = solve_pose(unposed, corners, pixels, sigma=sigma)
+        stage.figures.update(
+            {
+                "rms": found.rms,
+                "residuals": found.residuals,
+                "position": found.world_from_camera.translation,
+                "sigma_position": found.sigma_position,
+                "sigma_rotation_degrees": [math.degrees(v) for v in found.sigma_rotation],
+                "rival_rms": found.rival_rms,
+                "ambiguous": found.ambiguous,
+            }
+        )
+        with stage.output(output) as temporary:
+            unposed.posed(found.world_from_camera).write(temporary)
+    if found.ambiguous:
+        say(
+            "the clicks fit a second pose almost as well: click more exactly, or take the "
+            "plate from nearer the floor rectangle"
+        )
+    if json:
+        print_figures(stage.figures)
+        return
+    x, y, z = found.world_from_camera.translation
+    errors = ", ".join(f"{v * 1000:.1f}" for v in found.sigma_position)
+    turns = ", ".join(f"{math.degrees(v):.3f}" for v in found.sigma_rotation)
+    print(f"{output}: camera at {x:.3f}, {y:.3f}, {z:.3f} m, RMS {found.rms:.2f} px")
+    print(f"standard errors {errors} mm; pitch, yaw, roll {turns} degrees")
+
+
+def _points(text: str) -> list[tuple[float, float]]:
+    """Pixels from "x,y x,y ..."."""
+    pixels: list[tuple[float, float]] = []
+    for item in text.split():
+        try:
+            x, y = (float(v) for v in item.split(","))
+        except ValueError as error:
+            raise UserError(
+                f'{item!r} is no pixel; write --points "x,y x,y x,y x,y"'
+            ) from error
+        pixels.append((x, y))
+    return pixels
+
+
+def _corners(align: Path) -> list[list[float]]:
+    """World corners (N, 3) of align.json."""
+    value = read_json(align)
+    corners = value.get("corners") if isinstance(value, dict) else None
+    try:
+        points = [[float(v) for v in corner] for corner in corners or []]
+    except (TypeError, ValueError):
+        points = []
+    if not points or any(len(p) != 3 for p in points):
+        raise UserError("no world corners in it; make it with `envmap align`", file=align)
+    return points
