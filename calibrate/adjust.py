@@ -1,9 +1,8 @@
 """Least squares for one camera of any model before a board that may be bowed.
 
 Unknowns are the intrinsics, the bow and a pose for each view. Derivatives are exact, through
-the camera's own; the poses, which meet only in the intrinsics, are eliminated (the Schur
-complement of Triggs et al. 2000, section 6.1). Steps are Levenberg-Marquardt's, weights
-Cauchy's where corners may be wrong.
+the camera's own; the poses meet only in the intrinsics (:mod:`chromeball.calibrate.arrow`).
+Weights are Cauchy's where corners may be wrong.
 """
 
 from __future__ import annotations
@@ -15,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from chromeball.calibrate.arrow import Arrowhead, cauchy, descend
 from chromeball.scene.camera import CameraModel
 from chromeball.scene.errors import UserError
 
@@ -117,26 +117,13 @@ def adjust(
         The relative gain of the cost below which a step is the last.
 
     """
-    damping = 1e-4
-    cost, system = _linearise(estimate, board, corners, used, free, precision, scale)
-    for _ in range(steps if math.isfinite(cost) else 0):
-        candidate = _stepped(estimate, system, free, damping)
-        new_cost, new_system = math.inf, system
-        if candidate is not None:
-            new_cost, new_system = _linearise(
-                candidate, board, corners, used, free, precision, scale
-            )
-        if candidate is not None and new_cost <= cost:
-            gain = cost - new_cost
-            estimate, cost, system = candidate, new_cost, new_system
-            damping = max(damping / 10, 1e-10)
-            if gain <= least_gain * cost:
-                break
-        elif damping > 1e8:
-            break
-        else:
-            damping *= 10
-    return estimate
+    return descend(
+        estimate,
+        lambda at: _linearise(at, board, corners, used, free, precision, scale),
+        lambda at, shared, poses: _moved(at, free, shared, poses),
+        steps=steps,
+        least_gain=least_gain,
+    )
 
 
 def covariance(
@@ -159,14 +146,7 @@ def covariance(
     """
     free = np.ones(len(precision), bool)
     _, system = _linearise(estimate, board, corners, used, free, precision, math.inf)
-    try:
-        schur, _, _ = _reduce(system, 0.0)
-        size = np.sqrt(np.diag(schur))
-        scaled = schur / np.outer(size, size)
-        condition = float(np.linalg.cond(scaled))
-        inverse = np.linalg.inv(scaled) / np.outer(size, size)
-    except np.linalg.LinAlgError:
-        condition, inverse = math.inf, np.zeros_like(system[0])
+    inverse, condition = system.covariance()
     if not condition < 1e13:
         raise UserError(
             "these pictures do not determine the lens: take more, with the board tilted and "
@@ -177,14 +157,6 @@ def covariance(
 
 # ---- the normal equations
 
-type System = tuple[
-    NDArray[np.float64],  # (s, s) of the shared unknowns
-    NDArray[np.float64],  # (V, 6, s) between poses and shared unknowns
-    NDArray[np.float64],  # (V, 6, 6) of the poses
-    NDArray[np.float64],  # (s,) gradient
-    NDArray[np.float64],  # (V, 6) gradient
-]
-
 
 def _linearise(
     estimate: Estimate,
@@ -194,7 +166,7 @@ def _linearise(
     free: NDArray[np.bool_],
     precision: NDArray[np.float64],
     scale: float,
-) -> tuple[float, System]:
+) -> tuple[float, Arrowhead]:
     """Cost, and J'J and J'e over the free unknowns; a pose's change is exp(w) R, t + dt."""
     shape = _bow_shape(board)
     bowed = board + (shape @ estimate.bow)[..., None] * [0.0, 0, 1]
@@ -205,11 +177,7 @@ def _linearise(
     views = len(corners)
     error = np.where(used[..., None], q - corners, 0.0)
     square = (error**2).sum(axis=-1)
-    if math.isinf(scale):
-        cost, weight = float(square.sum()), used.astype(float)
-    else:
-        cost = float(scale**2 * np.log1p(square / scale**2).sum())
-        weight = used / (1 + square / scale**2)
+    cost, weight = cauchy(square, used, scale)
     # d pixel / d bow = d pixel / d point R e_z (1 - x^2)
     normals = estimate.rotations[:, None, None, :, 2, None]
     by_bow = (by_point @ normals) * shape[:, :, None]
@@ -220,62 +188,32 @@ def _linearise(
     shared[unused], pose[unused] = 0.0, 0.0
 
     rows = 2 * used[0].size
-    w = np.repeat(weight.reshape(views, -1), 2, axis=1)[..., None]
-    a = shared.reshape(views, rows, int(free.sum()))
-    b = pose.reshape(views, rows, 6)
-    e = error.reshape(views, rows, 1)
-    a_t, b_t = np.swapaxes(w * a, 1, 2), np.swapaxes(w * b, 1, 2)
+    system = Arrowhead.of(
+        shared.reshape(views, rows, int(free.sum())),
+        pose.reshape(views, rows, 6),
+        error.reshape(views, rows),
+        np.repeat(weight.reshape(views, -1), 2, axis=1),
+    )
     value = np.concatenate([estimate.camera.intrinsics, estimate.bow])[free]
     known = precision[free]
+    system.know(known, value)
     cost += float(known @ value**2)
-    system = (
-        (a_t @ a).sum(axis=0) + np.diag(known),
-        b_t @ a,
-        b_t @ b,
-        (a_t @ e).sum(axis=0)[:, 0] + known * value,
-        (b_t @ e)[..., 0],
-    )
     return cost if math.isfinite(cost) else math.inf, system
 
 
-def _reduce(
-    system: System, damping: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Schur complement (s, s), inverses of the poses' blocks, those times the coupling."""
-    shared, between, poses, _, _ = system
-    axis = np.arange(6)
-    damped = poses.copy()
-    damped[:, axis, axis] *= 1 + damping
-    inverse = np.linalg.inv(damped)
-    coupling = inverse @ between
-    schur = shared + damping * np.diag(np.diag(shared))
-    schur = schur - (np.swapaxes(between, 1, 2) @ coupling).sum(axis=0)
-    return schur, inverse, coupling
-
-
-def _stepped(
-    estimate: Estimate, system: System, free: NDArray[np.bool_], damping: float
+def _moved(
+    estimate: Estimate,
+    free: NDArray[np.bool_],
+    shared: NDArray[np.float64],
+    poses: NDArray[np.float64],
 ) -> Estimate | None:
-    """One damped step; None where the equations are singular or the camera impossible."""
+    """The estimate after a step; None where the camera would be impossible."""
     from scipy.spatial.transform import Rotation
 
-    _, between, _, shared_gradient, pose_gradient = system
-    try:
-        schur, inverse, coupling = _reduce(system, damping)
-        own = (inverse @ pose_gradient[..., None])[..., 0]
-        right = (
-            -shared_gradient + (np.swapaxes(between, 1, 2) @ own[..., None]).sum(axis=0)[:, 0]
-        )
-        size = np.sqrt(np.abs(np.diag(schur))) + 1e-300
-        shared = np.linalg.solve(schur / np.outer(size, size), right / size) / size
-    except np.linalg.LinAlgError:
-        return None
-    poses = -own - coupling @ shared
     change = np.zeros(len(free))
     change[free] = shared
     intrinsics = estimate.camera.intrinsics + change[:-2]
-    focal = intrinsics[: 2 if len(intrinsics) > 3 else 1]
-    if not (np.isfinite(change).all() and np.isfinite(poses).all() and focal.min() > 0):
+    if intrinsics[: 2 if len(intrinsics) > 3 else 1].min() <= 0:
         return None
     return Estimate(
         camera=replace(estimate.camera, intrinsics=intrinsics),
