@@ -48,6 +48,10 @@ class Frames:
     def __len__(self) -> int:
         return len(self.translations)
 
+    def poses(self) -> list[Pose]:
+        """As a list of poses."""
+        return [Pose(r, t) for r, t in zip(self.rotations, self.translations, strict=True)]
+
     def inverse(self) -> Frames:
         """Every pose undone."""
         back = np.swapaxes(self.rotations, -1, -2)
@@ -68,7 +72,9 @@ def hand_eye(sensor: Frames, board: Frames) -> tuple[Pose, Pose, NDArray[np.bool
     """
     count = len(sensor)
     if count < 3:
-        raise UserError(f"{count} pictures with a pose of the tracker; three or more are needed")
+        raise UserError(
+            f"{count} pictures with a pose of the tracker; three or more are needed"
+        )
     refuse_single_axis(board)
     rng = np.random.default_rng(0)
     threes = np.array([rng.choice(count, 3, replace=False) for _ in range(TRIALS)])
@@ -110,7 +116,7 @@ def view_errors(
 
 
 def turns_between(frames: Frames) -> Array:
-    """Rotation vectors from each view to each later one, in the former's camera axes, (P, 3)."""
+    """Rotation vectors from each view to each later one, in the former's axes, (P, 3)."""
     from scipy.spatial.transform import Rotation
 
     i, j = np.triu_indices(len(frames), 1)
@@ -131,8 +137,8 @@ def refuse_single_axis(board: Frames) -> None:
     size, axes = np.linalg.eigh(turns.T @ turns / max(len(turns), 1))
     if math.sqrt(max(size[2], 0.0)) < LEAST_TURN:
         raise UserError(
-            "the camera did not turn between the pictures, which leaves its place on the sensor "
-            "open: tilt and roll it by 30 degrees or more, about two axes"
+            "the camera did not turn between the pictures, which leaves its place on the "
+            "sensor open: tilt and roll it by 30 degrees or more, about two axes"
         )
     if math.sqrt(max(size[1], 0.0)) < LEAST_TURN:
         raise UserError(

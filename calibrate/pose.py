@@ -192,7 +192,7 @@ def _linearise(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     turned = p @ pose.rotation.T
     projected, slope = camera.project_with_jacobian(turned + pose.translation)
-    jacobian = np.concatenate([-slope @ _cross(turned), slope], axis=-1)
+    jacobian = np.concatenate([-slope @ cross_matrix(turned), slope], axis=-1)
     return (projected - q).ravel(), jacobian.reshape(-1, 6)
 
 
@@ -209,7 +209,7 @@ def _covariance(pose: Pose, jacobian: NDArray[np.float64], sigma: float) -> NDAr
     back = pose.rotation.T
     change = np.zeros((6, 6))
     change[:3, :3] = -np.eye(3)
-    change[3:, :3] = -back @ _cross(pose.translation)
+    change[3:, :3] = -back @ cross_matrix(pose.translation)
     change[3:, 3:] = -back
     return sigma**2 * change @ np.linalg.inv(normal) @ change.T
 
@@ -238,7 +238,7 @@ def _turn_to_z(axis: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack([x, np.cross(axis, x), axis])
 
 
-def _cross(v: NDArray[np.float64]) -> NDArray[np.float64]:
+def cross_matrix(v: NDArray[np.float64]) -> NDArray[np.float64]:
     """[v] with [v] a = v x a, ``(..., 3) -> (..., 3, 3)``."""
     zero = np.zeros_like(v[..., 0])
     x, y, z = v[..., 0], v[..., 1], v[..., 2]

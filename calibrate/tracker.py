@@ -21,9 +21,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from chromeball.calibrate.hand_eye import Frames, hand_eye, view_errors
+from chromeball.calibrate.hand_eye import FAR, Frames, hand_eye, view_errors
 from chromeball.calibrate.tracker_adjust import Noise, Rows, State, adjust, covariance
-from chromeball.calibrate.tracker_log import TrackerLog, reached, sample
+from chromeball.calibrate.tracker_checks import check_scale, refuse_open, refuse_unlike
+from chromeball.calibrate.tracker_log import TrackerLog, reached, sample, usual_window
 from chromeball.scene.camera import CameraModel
 from chromeball.scene.errors import UserError
 from chromeball.scene.pose import Pose
@@ -32,12 +33,10 @@ type Array = NDArray[np.float64]
 
 #: Fewest pictures from which the tracker's noise can be told as well.
 FEWEST_FOR_NOISE = 6
-#: Squared distance of a sound pose that 1 in 1000 exceeds: chi-squared with 6 degrees.
-OUTLIER = 22.46
+#: Share of sound poses that lie farther off than what counts as an outlier.
+OUTLIER = 1e-3
 #: Medians of chi-squared with 3 and 2 degrees of freedom.
 MEDIAN_3, MEDIAN_2 = 2.366, 1.386
-#: Standard errors beyond which an answer is none: radians, metres, seconds.
-WORST_TURN, WORST_PLACE = math.radians(5), 0.1
 #: The delay is searched so far to both sides, seconds, in steps of so much.
 SEARCH, STEP = 0.5, 0.01
 
@@ -52,8 +51,8 @@ class TrackerSolution:
     tracker's position an axis (metres) and of its turn an axis (radians). ``used`` (V,) says
     which pictures fit; ``turn_errors`` (V,) and ``place_errors`` (V,) by how much tracker and
     picture differ, radians and metres, NaN for pictures outside the log; ``distances`` (V,) the
-    same in standard errors, squared. ``second_axis`` is the RMS turn about the second axis of
-    the motion, radians.
+    same in standard errors, squared. ``scale`` is how many times as far the tracker moved as
+    the pictures say, a check that takes no part in the solution.
     """
 
     sensor_from_camera: Pose
@@ -67,24 +66,13 @@ class TrackerSolution:
     place_errors: Array
     distances: Array
     condition: float
+    scale: float
+    sigma_scale: float
 
     @property
     def standard_errors(self) -> Array:
         """Of the 13 unknowns, in the order of ``covariance``."""
         return np.sqrt(np.diag(self.covariance))
-
-    def world_from_camera(
-        self, log: TrackerLog, times: Array, world_from_tracker: Pose | None = None
-    ) -> list[Pose]:
-        """Where the camera was at `times` (V,) on the pictures' clock; without a
-        `world_from_tracker` in the tracker's axes.
-        """  # noqa: D205
-        there = world_from_tracker or Pose.identity()
-        sensor = sample(log, np.asarray(times, float) + self.delay)
-        return [
-            there @ Pose(r, t) @ self.sensor_from_camera
-            for r, t in zip(sensor.rotations, sensor.positions, strict=True)
-        ]
 
 
 def solve_tracker(
@@ -97,7 +85,7 @@ def solve_tracker(
     delay: float | None = None,
     position_noise: float | None = None,
     rotation_noise: float | None = None,
-    window: float = 0.0,
+    window: float | None = None,
     search: float = SEARCH,
     tell: Callable[[str], object] | None = None,
 ) -> TrackerSolution:
@@ -120,7 +108,8 @@ def solve_tracker(
     position_noise, rotation_noise
         Standard deviations an axis, metres and radians, where known; else estimated.
     window
-        Smoothing of the log, seconds (:func:`chromeball.calibrate.tracker_log.sample`).
+        Smoothing of the log, seconds (:func:`chromeball.calibrate.tracker_log.sample`); by
+        default eight samples, and 0 is none.
     search
         How far the delay may be from zero, seconds.
     tell
@@ -139,6 +128,7 @@ def solve_tracker(
         raise UserError("the log has times; the pictures' are needed, too")
     if not timed and len(log.positions) != count:
         raise UserError(f"{len(log.positions)} poses of the tracker for {count} pictures")
+    window = usual_window(log) if window is None else window
     views, boards = _place_boards(camera, points, pixels, say)
     clock = np.asarray(times, float)[views] if timed and times is not None else np.zeros(0)
     if timed and delay is None:
@@ -154,33 +144,48 @@ def solve_tracker(
     _enough(len(views), position_noise is None or rotation_noise is None)
 
     rows = Rows(camera, points, pixels[views], log, clock, window, views)
-    sensor = rows.sensor(start)
-    x, z, agree = hand_eye(Frames(sensor.rotations, sensor.positions), boards.inverse())
+    sensed = rows.sensor(start)
+    sensor = Frames(sensed.rotations, sensed.positions)
+    x, z, agree = hand_eye(sensor, boards.inverse())
+    turned = _upside_down(points, x, z, sensor, boards, agree)
+    if turned.any():
+        say(f"{int(turned.sum())} boards were read upside down, as the tracker shows")
+        half = _half_turn(points)
+        boards = Frames.of(
+            [b @ half if t else b for b, t in zip(boards.poses(), turned, strict=True)]
+        )
+        read = np.where(turned[:, None, None], rows.pixels[:, ::-1], rows.pixels)
+        rows = replace(rows, pixels=read)
+        agree |= turned
     free_delay = timed and delay is None
     state = State(x, z, start, boards.rotations, boards.translations)
     given = (position_noise, rotation_noise)
     noise = _first_noise(rows, state, agree, given)
     weights = agree.astype(float)
     for _ in range(4):  # Cauchy's weights: half at 2.4 deviations of six numbers
-        state = adjust(rows, state, noise, weights, free_delay, steps=15)
+        state = adjust(rows, state, noise, weights, False, steps=15)
         noise = _first_noise(rows, state, agree, given)
         weights = 1 / (1 + rows.distances(state, noise) / (2.4**2 * 6))
     used = np.zeros(len(views), bool)
+    if free_delay:  # refused here, before it can wander
+        covariance(rows, state, noise, weights > 0.5, True)
     for _ in range(20):
-        fits = rows.distances(state, noise) <= OUTLIER
+        fits = rows.distances(state, noise) <= _limit(int(used.sum()), None in given)
         if (fits == used).all() and used.any():
             break
         used = fits
         _enough(int(used.sum()), None in given)
         state, noise = _settle(rows, state, noise, used, free_delay, given)
+    scale, sigma_scale = check_scale(rows, state, used)
+    refuse_unlike(rows, state, noise)
     spread, condition = covariance(rows, state, noise, used, free_delay)
-    _refuse_open(spread)
+    refuse_open(spread)
     turn, place, distance = (np.full(count, np.nan) for _ in range(3))
-    sensor = rows.sensor(state.delay)
+    sensed = rows.sensor(state.delay)
     turn[views], place[views] = view_errors(
         state.sensor_from_camera,
         state.tracker_from_board,
-        Frames(sensor.rotations, sensor.positions),
+        Frames(sensed.rotations, sensed.positions),
         Frames(state.rotations, state.translations).inverse(),
     )
     distance[views] = rows.distances(state, noise)
@@ -198,6 +203,8 @@ def solve_tracker(
         place_errors=place,
         distances=distance,
         condition=condition,
+        scale=scale,
+        sigma_scale=sigma_scale,
     )
 
 
@@ -224,6 +231,35 @@ def _place_boards(
     if len(views) < 3:
         raise UserError(f"only {len(views)} pictures place the board; three or more are needed")
     return np.array(views, np.intp), Frames.of(poses)
+
+
+def _half_turn(points: Array) -> Pose:
+    """The board turned by 180 degrees in its plane."""
+    return Pose(np.diag([-1.0, -1, 1]), (points[0] + points[-1]) * [1, 1, 0])
+
+
+def _upside_down(
+    points: Array,
+    x: Pose,
+    z: Pose,
+    sensor: Frames,
+    boards: Frames,
+    agree: NDArray[np.bool_],
+) -> NDArray[np.bool_]:
+    """Views (V,) that fit only if their board was read the other way round.
+
+    A board that looks alike after half a turn, or nearly so, is read either way.
+    """
+    half = _half_turn(points)
+    if not np.allclose(half.apply(points), points[::-1]):
+        return np.zeros(len(boards), bool)
+    other = Frames.of([b @ half for b in boards.poses()])
+    turn, place = view_errors(x, z, sensor, boards.inverse())
+    new_turn, new_place = view_errors(x, z, sensor, other.inverse())
+    fits = (new_turn <= FAR * np.median(turn[agree])) & (
+        new_place <= FAR * np.median(place[agree])
+    )
+    return np.asarray(fits & ~agree, bool)
 
 
 def _search_delay(
@@ -271,18 +307,31 @@ def _enough(count: int, estimated: bool) -> None:
         raise UserError(f"{count} pictures and poses fit together; {least} are needed{more}")
 
 
+def _limit(count: int, estimated: bool) -> float:
+    """Squared distance of a pose beyond which it is wrong, of noises from `count` poses."""
+    from scipy import stats
+
+    redundancy = 6 * count - 12 if estimated and count else 1e6
+    return float(6 * stats.f.ppf(1 - OUTLIER, 6, redundancy))
+
+
 def _first_noise(
     rows: Rows,
     state: State,
     agree: NDArray[np.bool_],
     given: tuple[float | None, float | None],
 ) -> Noise:
-    """Noises by medians, which wrong poses hardly move."""
+    """Noises by medians, which wrong poses hardly move.
+
+    Both unknown poses are fitted, two views' worth: few views differ less than their noise
+    (Rousseeuw and Leroy 1987, 1 + 5 / (n - p)).
+    """
     pixel, place, turn = rows.raw(state)
+    few = 1 + 5 / max(int(agree.sum()) - 2, 1)
     square = (pixel[agree] ** 2).sum(axis=-1)
     sigma = math.sqrt(float(np.nanmedian(square)) / MEDIAN_2)
     position, rotation = (
-        math.sqrt(float(np.median((v[agree] ** 2).sum(axis=-1))) / MEDIAN_3)
+        few * math.sqrt(float(np.median((v[agree] ** 2).sum(axis=-1))) / MEDIAN_3)
         for v in (place, turn)
     )
     return Noise(sigma, given[0] or position, given[1] or rotation).floored()
@@ -309,24 +358,3 @@ def _settle(
         if noise.like(before):
             break
     return adjust(rows, state, noise, weights, free_delay), noise
-
-
-def _refuse_open(spread: Array) -> None:
-    """Refuse an answer whose standard errors say that it is none."""
-    from chromeball.calibrate.hand_eye import name_axis
-
-    for block, of in ((0, "camera on the sensor"), (6, "board in the tracker's space")):
-        size, axes = np.linalg.eigh(spread[block : block + 3, block : block + 3])
-        if not size[2] < WORST_TURN**2:
-            about = f" about {name_axis(axes[:, 2])}" if block == 0 else ""
-            raise UserError(
-                f"the turn of the {of} stays open{about} (standard error "
-                f"{math.degrees(math.sqrt(size[2])):.0f} degrees): turn the camera further, "
-                "about two axes or three, or take more pictures"
-            )
-        size, axes = np.linalg.eigh(spread[block + 3 : block + 6, block + 3 : block + 6])
-        if not size[2] < WORST_PLACE**2:
-            raise UserError(
-                f"the place of the {of} stays open (standard error {math.sqrt(size[2]):.2f} m): "
-                "turn the camera further, about two axes or three, or take more pictures"
-            )

@@ -12,13 +12,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from chromeball.calibrate.tracker_log import (
-    Sampled,
-    TrackerLog,
-    cross_matrix,
-    right_jacobian,
-    sample,
-)
+from chromeball.calibrate.pose import cross_matrix
+from chromeball.calibrate.tracker_log import Sampled, TrackerLog, right_jacobian, sample
 from chromeball.scene.camera import CameraModel
 from chromeball.scene.errors import UserError
 from chromeball.scene.pose import Pose
@@ -42,9 +37,7 @@ class Noise:
 
     def floored(self) -> Noise:
         """None of them zero, for data without noise."""
-        return Noise(
-            max(self.pixel, 1e-5), max(self.position, 1e-8), max(self.rotation, 1e-8)
-        )
+        return Noise(max(self.pixel, 1e-5), max(self.position, 1e-8), max(self.rotation, 1e-8))
 
     def like(self, other: Noise) -> bool:
         """Whether both are the same to a part in a thousand."""
@@ -114,15 +107,15 @@ class Rows:
         pixel = self._pixels(state)[0]
         sensor = self.sensor(state.delay)
         place, turn = self._tracker(state, sensor)[:2]
-        share = np.sqrt(sensor.variance * sensor.shared)[:, None]
+        share = np.sqrt(sensor.variance)[:, None]
         return pixel, place / share, turn / share
 
     def distances(self, state: State, noise: Noise) -> Array:
         """Squared distance of tracker and picture in standard deviations, (V,)."""
         _, place, turn = self.raw(state)
-        return ((place / noise.position) ** 2).sum(axis=1) + (
-            (turn / noise.rotation) ** 2
-        ).sum(axis=1)
+        return ((place / noise.position) ** 2).sum(axis=1) + ((turn / noise.rotation) ** 2).sum(
+            axis=1
+        )
 
     def normal(self, state: State, noise: Noise, weights: Array, free_delay: bool) -> _Normal:
         """Normal equations at `state`, tracker rows times `weights` (V,)."""
@@ -183,6 +176,7 @@ class Rows:
         taken = np.einsum("vni,vij,vnj->", slope, own, slope)
         pixel = _component(noise.pixel, error, 2 * int(self.seen.sum()) - float(taken))
         residual, j_own, j_shared = self.tracker_rows(state, noise, free_delay)
+        residual = residual * np.sqrt(self.sensor(state.delay).shared)[:, None]
         diagonal = (
             np.einsum("vni,vij,vnj->vn", j_own, own, j_own)
             + 2 * np.einsum("vni,vij,vnj->vn", j_own, cross, j_shared)
@@ -254,7 +248,7 @@ def adjust(
     damping = 1e-4
     normal = rows.normal(state, noise, weights, free_delay)
     for _ in range(steps):
-        candidate = _stepped(state, normal, damping, free_delay)
+        candidate = _stepped(state, normal, damping, free_delay, rows.log.interval)
         new = rows.normal(candidate, noise, weights, free_delay)
         if math.isfinite(new.cost) and new.cost <= normal.cost:
             gain = normal.cost - new.cost
@@ -327,7 +321,10 @@ def _reduced(normal: _Normal, free_delay: bool) -> tuple[Array, Array, Array]:
     return spread, inverse, coupling
 
 
-def _stepped(state: State, normal: _Normal, damping: float, free_delay: bool) -> State:
+def _stepped(
+    state: State, normal: _Normal, damping: float, free_delay: bool, reach: float
+) -> State:
+    """One damped step, the delay's no longer than `reach`."""
     from scipy.spatial.transform import Rotation
 
     schur, inverse, coupling = _schur(normal, damping)
@@ -338,19 +335,22 @@ def _stepped(state: State, normal: _Normal, damping: float, free_delay: bool) ->
     step = np.zeros(SHARED)
     scaled = schur[:kept, :kept] / np.outer(size, size)
     step[:kept] = np.linalg.lstsq(scaled, right[:kept] / size, rcond=1e-15)[0] / size
+    if free_delay:
+        step[12] = np.clip(step[12], -reach, reach)
     views = -own - coupling @ step
     x, z = state.sensor_from_camera, state.tracker_from_board
     turns = Rotation.from_rotvec(views[:, :3]) * Rotation.from_matrix(state.rotations)
     return State(
-        _moved(x, step[:6]),
-        _moved(z, step[6:12]),
+        moved(x, step[:6]),
+        moved(z, step[6:12]),
         state.delay + float(step[12]),
         turns.as_matrix(),
         state.translations + views[:, 3:],
     )
 
 
-def _moved(pose: Pose, step: Array) -> Pose:
+def moved(pose: Pose, step: Array) -> Pose:
+    """Turned from the left by the first three of `step`, shifted by the others."""
     from scipy.spatial.transform import Rotation
 
     turned = Rotation.from_rotvec(step[:3]) * Rotation.from_matrix(pose.rotation)

@@ -27,6 +27,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from chromeball.calibrate.pose import cross_matrix
 from chromeball.scene.errors import UserError
 from chromeball.scene.record import read_json
 
@@ -127,6 +128,14 @@ def sample(log: TrackerLog, times: Array, window: float = 0.0) -> Sampled:
     )
 
 
+def usual_window(log: TrackerLog) -> float:
+    """Eight samples, so that velocities are not the noise's; none above a quarter of a second,
+    in which a hand does not move along a parabola any more.
+    """  # noqa: D205
+    window = 8 * log.interval
+    return window if window <= 0.25 else 0.0
+
+
 def reached(log: TrackerLog, times: Array, window: float = 0.0) -> NDArray[np.bool_]:
     """Which of `times` (V,) the log covers, without a gap around them."""
     if log.times is None:
@@ -166,9 +175,7 @@ def _parabola(
     kernel = np.where(inside, np.clip(1 - np.abs(tau) ** 3, 1e-6, None) ** 3, 0.0)
     design = tau[..., None] ** np.arange(3)
     weighted = design * kernel[..., None]
-    solved = np.linalg.solve(
-        np.swapaxes(design, 1, 2) @ weighted, np.swapaxes(weighted, 1, 2)
-    )
+    solved = np.linalg.solve(np.swapaxes(design, 1, 2) @ weighted, np.swapaxes(weighted, 1, 2))
     return index, solved[:, 0], solved[:, 1] / half
 
 
@@ -181,11 +188,6 @@ def right_jacobian(phi: Array) -> Array:
     b = np.where(small, 1 / 6 - angle**2 / 120, (safe - np.sin(safe)) / safe**3)
     k = cross_matrix(phi)
     return np.eye(3) - a * k + b * (k @ k)
-
-
-def cross_matrix(v: Array) -> Array:
-    """[v] with [v] a = v x a, ``(..., 3) -> (..., 3, 3)``."""
-    return np.cross(np.eye(3), v[..., None, :])
 
 
 # ---- files
@@ -212,7 +214,8 @@ def read_log(path: str | os.PathLike[str]) -> TrackerLog:
     quaternion = set(QUATERNION) <= names
     if not quaternion and not set(ANGLES) <= names:
         raise UserError(
-            f"needs columns {', '.join(QUATERNION)}, or {', '.join(ANGLES)} in degrees", file=path
+            f"needs columns {', '.join(QUATERNION)}, or {', '.join(ANGLES)} in degrees",
+            file=path,
         )
     timed = "t" in names
     if timed == ("file" in names):
@@ -306,17 +309,28 @@ def _rows(path: Path, key: str) -> list[dict[str, Any]]:
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f"cannot be read: {error}", file=path) from error
     try:
-        return list(csv.DictReader(io.StringIO(text), skipinitialspace=True, strict=True))
+        head, *lines = csv.reader(io.StringIO(text), skipinitialspace=True, strict=True)
+    except ValueError as error:
+        raise UserError(f"holds no {key}", file=path) from error
     except csv.Error as error:
         raise UserError(f"not a readable CSV: {error}", file=path) from error
+    lines = [line for line in lines if line]
+    for k, line in enumerate(lines):
+        if len(line) != len(head):
+            raise UserError(
+                f"row {k + 1} has {len(line)} fields, the first line {len(head)}", file=path
+            )
+    return [dict(zip(head, line, strict=True)) for line in lines]
 
 
 def _number(row: Mapping[str, Any], name: str, index: int, path: Path) -> float:
-    value = row.get(name)
+    value: Any = row.get(name)
     try:
-        number = float(value)  # pyright: ignore[reportArgumentType]
+        number = float(value)
     except (TypeError, ValueError) as error:
-        raise UserError(f"sample {index + 1}: {name} {value!r} is no number", file=path) from error
+        raise UserError(
+            f"sample {index + 1}: {name} {value!r} is no number", file=path
+        ) from error
     if not math.isfinite(number):
         raise UserError(f"sample {index + 1}: {name} {value!r} is not finite", file=path)
     return number

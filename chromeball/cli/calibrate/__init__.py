@@ -4,8 +4,9 @@ from cyclopts import App
 
 from chromeball.cli.calibrate.lens import lens
 from chromeball.cli.calibrate.pose import pose
+from chromeball.cli.calibrate.tracker import tracker
 from chromeball.cli.calibrate.undistort import undistort
 
 app = App(name="calibrate", help="Cameras and their poses.")
-for _command in (lens, pose, undistort):
+for _command in (lens, pose, tracker, undistort):
     app.command(_command)

@@ -52,6 +52,7 @@ DEEDS = {
     "envmap export": "The map turned as another program expects it.",
     "envmap prefilter": "The map blurred by the GGX lobe, for real-time engines.",
     "calibrate pose": "Where the photograph was taken from, by four points on the floor.",
+    "calibrate tracker": "Where the camera sits on a tracker's sensor, and its delay.",
     "stand-in build": "Stand-in geometry of the real place, as drawn on the panorama.",
     "stand-in depth": "How far away the light of each direction comes from.",
     "render": "The synthetic objects, lit by the map, in the photograph or the panorama.",
