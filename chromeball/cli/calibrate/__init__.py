@@ -6,7 +6,8 @@ from chromeball.cli.calibrate.lens import lens
 from chromeball.cli.calibrate.pose import pose
 from chromeball.cli.calibrate.tracker import tracker
 from chromeball.cli.calibrate.undistort import undistort
+from chromeball.cli.calibrate.wand import wand
 
 app = App(name="calibrate", help="Cameras and their poses.")
-for _command in (lens, pose, tracker, undistort):
+for _command in (lens, pose, tracker, undistort, wand):
     app.command(_command)
