@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from chromeball.calibrate.resection import POSE, Evidence, Fit, refine
 from chromeball.scene.camera import CameraModel
 from chromeball.scene.errors import UserError
 from chromeball.scene.pose import Pose
@@ -89,17 +90,20 @@ def solve_pose(
         x, y = outside[0]
         raise UserError(f"pixel {x:g},{y:g} lies outside the picture of {width}x{height}")
 
-    fits = [fit for start in start_poses(p, rays) if (fit := _refine(camera, p, q, start))]
+    clicks = Evidence(p, q)
+    fits = [
+        fit for start in start_poses(p, rays) if (fit := refine(camera, start, clicks, POSE))
+    ]
     if not fits:
         raise UserError("no pose fits these points: check their order and the camera's model")
-    fits.sort(key=lambda fit: float((fit[1] ** 2).sum()))
-    standing = [fit for fit in fits if not above_floor or fit[0].inverse().translation[1] > 0]
+    fits.sort(key=lambda fit: fit.cost)
+    standing = [fit for fit in fits if not above_floor or fit.pose.inverse().translation[1] > 0]
     if not standing:
         raise UserError(
             "the camera would stand below the floor: click the points in the order of the "
             "world points, and not mirrored"
         )
-    pose, residuals, jacobian = standing[0]
+    pose, residuals = standing[0].pose, standing[0].rows.reshape(-1, 2)
     rms = _rms(residuals)
     tolerance = max(10 * sigma, 0.01 * math.hypot(width, height))
     if rms > tolerance:
@@ -107,8 +111,8 @@ def solve_pose(
             f"the pixels miss the points by {rms:.1f} px: check their order, the rectangle's "
             "sides and the camera's model"
         )
-    distinct = [fit for fit in standing[1:] if not _same(fit[0], pose)]
-    rival = _rms(distinct[0][1]) if distinct else None
+    distinct = [fit for fit in standing[1:] if not _same(fit.pose, pose)]
+    rival = _rms(distinct[0].rows.reshape(-1, 2)) if distinct else None
     # The pose is ambiguous when the clicks' noise could swap the two: within 3 sigma.
     excess = math.inf if rival is None else len(p) * (rival**2 - rms**2) / sigma**2
     return PoseEstimate(
@@ -116,7 +120,7 @@ def solve_pose(
         residuals=residuals,
         rms=rms,
         sigma=sigma,
-        covariance=_covariance(pose, jacobian, sigma),
+        covariance=_covariance(standing[0], sigma),
         rival_rms=rival,
         ambiguous=excess < 9,
     )
@@ -152,65 +156,18 @@ def start_poses(points: NDArray[np.float64], rays: NDArray[np.float64]) -> list[
     return poses
 
 
-def _refine(
-    camera: CameraModel, p: NDArray[np.float64], q: NDArray[np.float64], start: Pose
-) -> tuple[Pose, NDArray[np.float64], NDArray[np.float64]] | None:
-    """Levenberg-Marquardt; ``camera_from_world``, residuals (N, 2), Jacobian (2N, 6).
-
-    The state is a turn about the camera's axes and a shift, exp(w) R p + t + dt.
-    """
-    pose, damping = start, 1e-3
-    error, jacobian = _linearise(camera, p, q, pose)
-    if not np.isfinite(error).all():
-        return None
-    for _ in range(100):
-        normal = jacobian.T @ jacobian
-        step = np.linalg.lstsq(
-            normal + damping * np.diag(np.diag(normal)), -jacobian.T @ error, rcond=None
-        )[0]
-        if np.abs(step).max() < 1e-13 * (1 + np.abs(pose.translation).max()):
-            break
-        turned = Pose.from_rotation_vector(step[:3], np.zeros(3)).rotation @ pose.rotation
-        u, _, vt = np.linalg.svd(turned)
-        candidate = Pose(u @ vt, pose.translation + step[3:])
-        new_error, new_jacobian = _linearise(camera, p, q, candidate)
-        if np.isfinite(new_error).all() and new_error @ new_error <= error @ error:
-            gain = error @ error - new_error @ new_error
-            pose, error, jacobian = candidate, new_error, new_jacobian
-            damping = max(damping / 10, 1e-12)
-            if gain <= 1e-14 * (1 + error @ error):
-                break
-        elif damping > 1e12:
-            break
-        else:
-            damping *= 10
-    return pose, error.reshape(-1, 2), jacobian
-
-
-def _linearise(
-    camera: CameraModel, p: NDArray[np.float64], q: NDArray[np.float64], pose: Pose
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    turned = p @ pose.rotation.T
-    projected, slope = camera.project_with_jacobian(turned + pose.translation)
-    jacobian = np.concatenate([-slope @ cross_matrix(turned), slope], axis=-1)
-    return (projected - q).ravel(), jacobian.reshape(-1, 6)
-
-
-def _covariance(pose: Pose, jacobian: NDArray[np.float64], sigma: float) -> NDArray[np.float64]:
+def _covariance(fit: Fit, sigma: float) -> NDArray[np.float64]:
     """Of (rotation about the camera's axes, position in the world).
 
-    With p_camera = R p + t the position is c = -R' t, so that a turn w and a shift dt move it
-    by dc = -R' [t] w - R' dt.
+    The state is exp(w) (R p + t) + dt: the position -R' t moves by -R' dt.
     """
-    normal = jacobian.T @ jacobian
+    normal = fit.jacobian.T @ fit.jacobian
     condition = float(np.linalg.cond(normal / np.sqrt(np.outer(*[np.diag(normal)] * 2))))
     if not condition < 1e12:
         raise UserError("the points do not determine the pose: they are too close together")
-    back = pose.rotation.T
     change = np.zeros((6, 6))
     change[:3, :3] = -np.eye(3)
-    change[3:, :3] = -back @ cross_matrix(pose.translation)
-    change[3:, 3:] = -back
+    change[3:, 3:] = -fit.pose.rotation.T
     return sigma**2 * change @ np.linalg.inv(normal) @ change.T
 
 
@@ -236,20 +193,6 @@ def _turn_to_z(axis: NDArray[np.float64]) -> NDArray[np.float64]:
     x = np.cross(helper, axis)
     x /= np.linalg.norm(x)
     return np.stack([x, np.cross(axis, x), axis])
-
-
-def cross_matrix(v: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[v] with [v] a = v x a, ``(..., 3) -> (..., 3, 3)``."""
-    zero = np.zeros_like(v[..., 0])
-    x, y, z = v[..., 0], v[..., 1], v[..., 2]
-    return np.stack(
-        [
-            np.stack([zero, -z, y], axis=-1),
-            np.stack([z, zero, -x], axis=-1),
-            np.stack([-y, x, zero], axis=-1),
-        ],
-        axis=-2,
-    )
 
 
 def _same(a: Pose, b: Pose) -> bool:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from chromeball.calibrate.pose import cross_matrix
+from chromeball.calibrate.resection import cross_matrix
 from chromeball.calibrate.tracker_log import Sampled, TrackerLog, right_jacobian, sample
 from chromeball.scene.camera import CameraModel
 from chromeball.scene.errors import UserError

@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from chromeball.calibrate.pose import cross_matrix
+from chromeball.calibrate.resection import cross_matrix
 from chromeball.scene.errors import UserError
 from chromeball.scene.record import read_json
 

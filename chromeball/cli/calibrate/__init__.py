@@ -2,12 +2,15 @@
 
 from cyclopts import App
 
+from chromeball.cli.calibrate.exif import exif
 from chromeball.cli.calibrate.lens import lens
+from chromeball.cli.calibrate.match import match
 from chromeball.cli.calibrate.pose import pose
+from chromeball.cli.calibrate.realign import realign
 from chromeball.cli.calibrate.tracker import tracker
 from chromeball.cli.calibrate.undistort import undistort
 from chromeball.cli.calibrate.wand import wand
 
 app = App(name="calibrate", help="Cameras and their poses.")
-for _command in (lens, pose, tracker, undistort, wand):
+for _command in (exif, lens, match, pose, realign, tracker, undistort, wand):
     app.command(_command)

@@ -6,8 +6,9 @@ import math
 from pathlib import Path
 
 from chromeball.cli.calibrate.arguments import Json, Out, print_figures, say
+from chromeball.cli.calibrate.clicks import parse_pixels, read_corners
 from chromeball.scene.errors import UserError
-from chromeball.scene.record import Stage, read_json
+from chromeball.scene.record import Stage
 
 
 def pose(
@@ -42,8 +43,8 @@ def pose(
 
     if not 0 < sigma < 1e3:
         raise UserError(f"--sigma {sigma:g}: a click's error in pixels is positive")
-    pixels = _points(points)
-    corners = _corners(align)
+    pixels = parse_pixels(points)
+    corners = read_corners(align)
     if len(pixels) != len(corners):
         raise UserError(f"{len(pixels)} points were given, {align} has {len(corners)} corners")
     unposed = CameraModel.read(camera)
@@ -76,30 +77,3 @@ def pose(
     turns = ", ".join(f"{math.degrees(v):.3f}" for v in found.sigma_rotation)
     print(f"{output}: camera at {x:.3f}, {y:.3f}, {z:.3f} m, RMS {found.rms:.2f} px")
     print(f"standard errors {errors} mm; pitch, yaw, roll {turns} degrees")
-
-
-def _points(text: str) -> list[tuple[float, float]]:
-    """Pixels from "x,y x,y ..."."""
-    pixels: list[tuple[float, float]] = []
-    for item in text.split():
-        try:
-            x, y = (float(v) for v in item.split(","))
-        except ValueError as error:
-            raise UserError(
-                f'{item!r} is no pixel; write --points "x,y x,y x,y x,y"'
-            ) from error
-        pixels.append((x, y))
-    return pixels
-
-
-def _corners(align: Path) -> list[list[float]]:
-    """World corners (N, 3) of align.json."""
-    value = read_json(align)
-    corners = value.get("corners") if isinstance(value, dict) else None
-    try:
-        points = [[float(v) for v in corner] for corner in corners or []]
-    except (TypeError, ValueError):
-        points = []
-    if not points or any(len(p) != 3 for p in points):
-        raise UserError("no world corners in it; make it with `envmap align`", file=align)
-    return points

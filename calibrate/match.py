@@ -1,0 +1,379 @@
+"""A camera from a single picture: points of known place, and lines along the world's axes.
+
+Focal length and pose are solved together, the principal point with them: it is believed to be
+the picture's middle within a share of its width, and what that leaves open is in the standard
+errors. No start is asked for: lenses of many fields of view are tried, each posed by points
+(perspective-n-point) or by the vanishing points of the lines, and the best ones refined. What
+fits as well as the best, but lies elsewhere, is told.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from chromeball.calibrate.pose import start_poses
+from chromeball.calibrate.resection import (
+    POSE,
+    UNKNOWNS,
+    Evidence,
+    Fit,
+    axis_directions,
+    focals,
+    linearise,
+    refine,
+)
+from chromeball.scene.camera import CameraModel
+from chromeball.scene.errors import UserError
+from chromeball.scene.pose import Pose
+
+type Array = NDArray[np.float64]
+
+#: Horizontal fields of view that are tried, degrees.
+FIELDS_OF_VIEW = np.geomspace(6, 140, 22)
+#: So many of them are refined, of each pose that a plane allows.
+TRIED = 5
+#: The principal point of an uncropped picture lies within this share of its width (1 sigma).
+CENTRE = 0.01
+#: A relative standard error of the focal length beyond which it is open.
+WORST_FOCAL = 0.2
+#: Excess of the squared rows below which two solutions cannot be told apart: 3 sigma.
+RIVAL = 9.0
+NAMES = ("focal", "cx", "cy", "pitch", "yaw", "roll", "x", "y", "z")
+
+
+@dataclass(frozen=True)
+class Match:
+    """A camera matched to a picture.
+
+    ``camera`` with its pose. ``residuals`` (N, 2) of the points, projected minus clicked, and
+    ``line_residuals`` (M,) how far a line's ends lie off its axis, pixels. ``covariance``
+    (9, 9) of ln f, the principal point (pixels), the turn about the camera's x, y, z (radians)
+    and the position (world, metres); zero for what was known. ``rivals`` are cameras elsewhere
+    that fit as well within 3 standard deviations.
+    """
+
+    camera: CameraModel
+    residuals: Array
+    line_residuals: Array
+    rms: float
+    sigma: float
+    covariance: Array
+    condition: float
+    rivals: tuple[CameraModel, ...]
+
+    @property
+    def standard_errors(self) -> Array:
+        """Of the nine unknowns, (9,)."""
+        return np.sqrt(np.diag(self.covariance))
+
+
+def match(
+    lens: CameraModel,
+    points: ArrayLike,
+    pixels: ArrayLike,
+    *,
+    axes: ArrayLike | None = None,
+    ends: ArrayLike | None = None,
+    sigma: float = 0.5,
+    focal_known: bool = False,
+    centre_sigma: float | None = None,
+    above_floor: bool = False,
+) -> Match:
+    """The camera that sees world `points` (N, 3) at `pixels` (N, 2), and lines along `axes`.
+
+    Parameters
+    ----------
+    lens
+        Size, distortion and the believed principal point; its focal length counts only where it
+        is known. A plain picture's is ``CameraModel.pinhole(size, 1.0)``.
+    points, pixels
+        Metres and pixels. Four and more of a plane or in space; two and more beside lines.
+    axes, ends
+        Lines: which axis of the world each runs along, 0 1 2 for x y z (M,), and its ends in
+        the picture (M, 2, 2), the second farther along the axis. Two lines or more of each of
+        two axes.
+    sigma
+        Standard deviation of a click, pixels.
+    focal_known
+        Only the pose is unknown.
+    centre_sigma
+        How far the principal point may be from `lens`'s, pixels; by default a hundredth of the
+        width. For a picture that was cropped: large.
+    above_floor
+        Only cameras with y > 0.
+
+    Raises
+    ------
+    UserError
+        Too little evidence, or evidence that leaves focal length or pose open, or that no
+        camera can have seen.
+
+    """
+    width = lens.size[0]
+    evidence = _evidence(lens, points, pixels, axes, ends, sigma)
+    n = focals(lens)
+    evidence = replace(
+        evidence,
+        centre=lens.intrinsics[n : n + 2].copy(),
+        centre_sigma=CENTRE * width if centre_sigma is None else centre_sigma,
+    )
+    free = POSE.copy() if focal_known else np.ones(UNKNOWNS, bool)
+    _check_count(evidence, focal_known)
+    fits = _solve(lens, evidence, free, focal_known)
+    standing = [fit for fit in fits if not above_floor or fit.pose.inverse().translation[1] > 0]
+    if not standing:
+        raise UserError(
+            "the camera would stand below the floor: click the points in the order of the "
+            "world points, and not mirrored"
+            if fits
+            else "no camera sees these points and lines like this: check their order and place"
+        )
+    best = standing[0]
+    count = len(evidence.points)
+    residuals = best.rows[: 2 * count].reshape(-1, 2) * sigma
+    along = best.rows[2 * count : 2 * count + len(evidence.axes)] * sigma * math.sqrt(2)
+    square = float((residuals**2).sum() + (along**2).sum())
+    rms = math.sqrt(square / max(count + len(along), 1))
+    tolerance = max(10 * sigma, 0.01 * math.hypot(*lens.size))
+    if rms > tolerance:
+        raise UserError(
+            f"the clicks miss the points and lines by {rms:.1f} px: check their order, which "
+            "axis a line runs along, and whether the lens distorts (--camera)"
+        )
+    covariance, condition = _covariance(best, free, evidence)
+    rivals = [
+        fit.camera.posed(fit.pose.inverse())
+        for fit in standing[1:]
+        if fit.cost - best.cost < RIVAL and not _same(fit, best)
+    ]
+    return Match(
+        camera=best.camera.posed(best.pose.inverse()),
+        residuals=residuals,
+        line_residuals=along,
+        rms=rms,
+        sigma=sigma,
+        covariance=covariance,
+        condition=condition,
+        rivals=tuple(rivals),
+    )
+
+
+def _evidence(
+    lens: CameraModel,
+    points: ArrayLike,
+    pixels: ArrayLike,
+    axes: ArrayLike | None,
+    ends: ArrayLike | None,
+    sigma: float,
+) -> Evidence:
+    p = np.asarray(points, float).reshape(-1, 3)
+    q = np.asarray(pixels, float).reshape(-1, 2)
+    if len(p) != len(q):
+        raise UserError(f"{len(p)} world points need as many pixels, not {len(q)}")
+    which = np.asarray([] if axes is None else axes, int).astype(np.intp).ravel()
+    line = np.asarray([] if ends is None else ends, float).reshape(-1, 2, 2)
+    if len(which) != len(line) or not ((which >= 0) & (which <= 2)).all():
+        raise UserError("every line needs its axis, 0, 1 or 2, and two ends")
+    clicked = np.concatenate([q, line.reshape(-1, 2)])
+    if not (np.isfinite(p).all() and np.isfinite(clicked).all()):
+        raise UserError("points and pixels must be finite")
+    width, height = lens.size
+    for x, y in clicked.tolist():
+        if not (-0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5):
+            raise UserError(f"pixel {x:g},{y:g} lies outside the picture of {width}x{height}")
+    gaps = np.linalg.norm(q[:, None] - q[None], axis=-1) + np.diag(np.full(len(q), np.inf))
+    if len(q) and gaps.min() < 1:
+        i, j = np.unravel_index(np.argmin(gaps), gaps.shape)
+        raise UserError(f"points {i + 1} and {j + 1} were clicked at the same pixel")
+    lengths = np.linalg.norm(line[:, 1] - line[:, 0], axis=1)
+    if len(line) and lengths.min() < 10:
+        raise UserError(f"line {int(np.argmin(lengths)) + 1} is shorter than 10 px: click more")
+    return Evidence(p, q, sigma, which, line)
+
+
+def _check_count(evidence: Evidence, focal_known: bool) -> None:
+    count, lines = len(evidence.points), len(evidence.axes)
+    if lines == 0 and count < 4:
+        raise UserError(
+            f"{count} points are too few: click four or more, or add lines along the axes"
+        )
+    if lines and count < 4:
+        if (np.bincount(evidence.axes, minlength=3) >= 2).sum() < 2:
+            raise UserError(
+                "too few lines: two or more along each of two axes, or four points and more"
+            )
+        if count < 2:
+            raise UserError(
+                "lines say where the camera looks, not where it stands: click two points whose "
+                "place is known, too"
+            )
+    unknowns = 6 if focal_known else 7
+    if 2 * count + lines < unknowns:
+        raise UserError(
+            f"{2 * count + lines} numbers for {unknowns} unknowns: click more points or lines"
+        )
+
+
+def _solve(
+    lens: CameraModel, evidence: Evidence, free: NDArray[np.bool_], focal_known: bool
+) -> list[Fit]:
+    """Distinct local minima, the best first."""
+    # The principal point stays where it is believed until the rest is in place.
+    held = free & ~np.isin(np.arange(UNKNOWNS), (1, 2))
+    # Of a plane two poses fit: each branch has its own best focal lengths.
+    branches: tuple[list[Fit], ...] = ([], [])
+    for camera in [lens] if focal_known else _candidates(lens):
+        for branch, pose in zip(branches, _starts(camera, evidence), strict=False):
+            first = linearise(camera, pose, evidence, held)
+            if np.isfinite(first.rows).all():
+                branch.append(first)
+    rough: list[Fit] = []
+    for branch in branches:
+        for start in sorted(branch, key=lambda fit: fit.cost)[:TRIED]:
+            fit = refine(start.camera, start.pose, evidence, held, steps=10)
+            if fit is not None and _sound(fit, evidence):
+                rough.append(fit)
+    rough.sort(key=lambda fit: fit.cost)
+    found: list[Fit] = []
+    for start in rough:
+        fit = refine(start.camera, start.pose, evidence, free, steps=60)
+        if fit is None or not _sound(fit, evidence) or any(_same(fit, f) for f in found):
+            continue
+        found.append(fit)
+    found.sort(key=lambda fit: fit.cost)
+    return found
+
+
+def _candidates(lens: CameraModel) -> list[CameraModel]:
+    """The lens with other focal lengths."""
+    cameras: list[CameraModel] = []
+    n = focals(lens)
+    for degrees in FIELDS_OF_VIEW:
+        values = lens.intrinsics.copy()
+        values[:n] *= lens.size[0] / (2 * math.tan(math.radians(degrees) / 2) * values[0])
+        cameras.append(replace(lens, intrinsics=values))
+    return cameras
+
+
+def _starts(camera: CameraModel, evidence: Evidence) -> list[Pose]:
+    """Poses camera_from_world by the points, or else by the lines."""
+    if len(evidence.points) >= 4:
+        rays = camera.unproject(evidence.pixels)
+        if np.isfinite(rays).all() and (poses := start_poses(evidence.points, rays)):
+            return poses
+    if not len(evidence.axes):
+        return []
+    turn = _turn_of_lines(camera, evidence)
+    if turn is None:
+        return []
+    # r x (R p + t) = 0 for every point
+    rays = camera.unproject(evidence.pixels)
+    if not np.isfinite(rays).all():
+        return []
+    cross = np.cross(np.eye(3), rays[:, None, :])  # rows of [r]
+    turned = evidence.points @ turn.T
+    right = -np.einsum("nij,nj->ni", cross, turned)
+    shift = np.linalg.lstsq(cross.reshape(-1, 3), right.ravel(), rcond=None)[0]
+    return [Pose(turn, shift)]
+
+
+def _turn_of_lines(camera: CameraModel, evidence: Evidence) -> Array | None:
+    """The rotation of camera_from_world by the vanishing points of two axes or three."""
+    rays = camera.unproject(evidence.ends)
+    if not np.isfinite(rays).all():
+        return None
+    normals = np.cross(rays[:, 0], rays[:, 1])
+    columns = np.full((3, 3), np.nan)
+    for axis in range(3):
+        own = normals[evidence.axes == axis]
+        if len(own) >= 2:
+            columns[:, axis] = np.linalg.svd(own)[2][2]
+    known = np.isfinite(columns[0])
+    if known.sum() < 2:
+        return None
+    turn = np.where(known, columns, 0.0)
+    # Signs: in the picture, too, the second end lies farther along the axis.
+    middle = camera.unproject(evidence.ends.mean(axis=1))
+    _, by_point = camera.project_with_jacobian(middle)
+    w = np.einsum("mij,mj->mi", by_point, turn.T[evidence.axes])
+    forth = (w * (evidence.ends[:, 1] - evidence.ends[:, 0])).sum(axis=1)
+    for axis in np.flatnonzero(known).tolist():
+        if forth[evidence.axes == axis].sum() < 0:
+            turn[:, axis] *= -1
+    if not known.all():
+        missing = int(np.flatnonzero(~known)[0])
+        turn[:, missing] = np.cross(turn[:, (missing + 1) % 3], turn[:, (missing + 2) % 3])
+    u, _, vt = np.linalg.svd(turn)
+    if np.linalg.det(u @ vt) < 0:
+        raise UserError(
+            "the lines' axes are left-handed: of each line the second end lies farther along "
+            "its axis, and x, y, z are right-handed with y up"
+        )
+    return np.asarray(u @ vt, float)
+
+
+def _sound(fit: Fit, evidence: Evidence) -> bool:
+    """Whether points lie before the camera and lines run the right way."""
+    if not np.isfinite(fit.rows).all():
+        return False
+    fov = 2 * math.atan(fit.camera.size[0] / (2 * fit.camera.intrinsics[0]))
+    if not math.radians(1) < fov < math.radians(170):
+        return False
+    if len(evidence.axes) == 0:
+        return True
+    w, s = axis_directions(fit.camera, fit.pose, evidence)
+    return bool(((w * s).sum(axis=1) > 0).all())
+
+
+def _covariance(fit: Fit, free: NDArray[np.bool_], evidence: Evidence) -> tuple[Array, float]:
+    """Covariance (9, 9) in the terms of :class:`Match`, and the scaled condition."""
+    normal = fit.jacobian.T @ fit.jacobian
+    size = np.sqrt(np.diag(normal))
+    condition = (
+        float(np.linalg.cond(normal / np.outer(size, size))) if (size > 0).all() else math.inf
+    )
+    spread = np.full((len(size), len(size)), math.inf)
+    if condition < 1e13:
+        spread = np.linalg.inv(normal)
+    focal = math.sqrt(spread[0, 0]) if free[0] else 0.0
+    if not focal < WORST_FOCAL:
+        raise UserError(_open(fit, evidence, focal))
+    if not condition < 1e13:
+        raise UserError("the points do not determine the pose: they are too close together")
+    change = np.eye(UNKNOWNS)
+    change[3:6, 3:6] *= -1
+    change[6:, 6:] = -fit.pose.rotation.T
+    full = np.zeros((UNKNOWNS, UNKNOWNS))
+    full[np.ix_(free, free)] = spread
+    return change @ full @ change.T, condition
+
+
+def _open(fit: Fit, evidence: Evidence, error: float) -> str:
+    """Why the focal length stays open, and what to do."""
+    known = f" (standard error {error:.0%})" if math.isfinite(error) else ""
+    start = f"this view leaves the focal length open{known}: "
+    rest = "give the lens with --camera --focal known"
+    p = evidence.points
+    if len(p) >= 3:
+        _, size, axes = np.linalg.svd(p - p.mean(axis=0))
+        if size[2] < 1e-6 * size[0]:
+            normal = fit.pose.rotation @ axes[2]
+            tilt = math.degrees(math.acos(min(1.0, abs(float(normal[2])))))
+            return (
+                f"{start}the points lie in a plane that is tilted by {tilt:.0f} degrees to the "
+                f"picture; photograph it more from the side, add points off it, or {rest}"
+            )
+    return f"{start}add points, nearer and farther, or lines along a second axis; or {rest}"
+
+
+def _same(a: Fit, b: Fit) -> bool:
+    turn = Pose(a.pose.rotation.T @ b.pose.rotation, np.zeros(3)).rotation_vector()
+    here, there = a.pose.inverse().translation, b.pose.inverse().translation
+    far = 1e-3 * max(float(np.linalg.norm(a.pose.translation)), 1e-9)
+    focal = abs(math.log(a.camera.intrinsics[0] / b.camera.intrinsics[0]))
+    near = float(np.linalg.norm(here - there)) < far
+    return bool(np.linalg.norm(turn) < 1e-3 and near and focal < 1e-3)
