@@ -10,11 +10,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bench import calibrate_fisheye
+from bench import calibrate_fisheye, calibrate_targets
 from bench.row import Row
 from chromeball.calibrate.detect import detect
 from chromeball.calibrate.lens import calibrate_lens, pose_errors
-from chromeball.calibrate.target import Charuco, Chessboard, CircleGrid
+from chromeball.calibrate.target import Chessboard, CircleGrid
 from chromeball.calibrate.virtual import board_poses, photograph, project
 from chromeball.scene.camera import CameraModel
 
@@ -27,10 +27,10 @@ def rows(quick: bool) -> list[Row]:
     """CPU seconds and errors of ours and of OpenCV's, interleaved."""
     count = 2 if quick else 8
     return [
-        *_charuco(count),
         *_circles(count),
         *(_left() if DATA.is_dir() else []),
         *calibrate_fisheye.rows(quick),
+        *calibrate_targets.rows(quick),
     ]
 
 
@@ -90,37 +90,6 @@ def _opencv_lens(corners: NDArray[np.float64], size: tuple[int, int]) -> tuple[A
     views = [view.reshape(-1, 1, 2).astype(np.float32) for view in corners]
     _, matrix, k, _, _ = cv.calibrateCamera([points] * len(views), views, size, None, None)
     return matrix, k
-
-
-def _charuco(count: int) -> list[Row]:
-    """Corners of a blurred ChArUco board whose places are known."""
-    values = np.array([520.0, 523, 331, 228, -0.24, 0.09, 0.001, -0.0008])
-    camera = CameraModel("LENSMODEL_OPENCV4", values, (640, 480))
-    board = Charuco(9, 6, 0.04, 0.03, "4X4_50")
-    poses = board_poses(board, camera, count, seed=3, size=0.6)
-    truth = project(board, camera, poses)
-    pictures = [photograph(board, camera, p, blur=2.0, seed=i) for i, p in enumerate(poses)]
-    cv: Any = cv2
-    seconds, found = [0.0, 0.0], np.full((2, *truth.shape), np.nan)
-    for i, picture in enumerate(pictures):
-        start = time.process_time()
-        found[0, i] = detect(picture, board)
-        seconds[0] += time.process_time() - start
-        start = time.process_time()
-        corners, ids, _, _ = cv.aruco.CharucoDetector(board.board()).detectBoard(picture)
-        seconds[1] += time.process_time() - start
-        if ids is not None:
-            found[1, i].reshape(-1, 2)[ids.ravel()] = corners.reshape(-1, 2)
-    rows: list[Row] = []
-    for tool, cpu, grid in zip(
-        ("chromeball", "cv2.aruco.CharucoDetector"), seconds, found, strict=True
-    ):
-        square = ((grid - truth) ** 2).sum(axis=-1)
-        share = float(np.isfinite(square).mean())
-        error = float(np.sqrt(np.nanmean(square))) if share else float("nan")
-        what = f"corners of {count} ChArUco pictures 640x480, blur 2 px"
-        rows.append(Row("calibrate", what, tool, cpu, error, "px", f"{share:.0%} found"))
-    return rows
 
 
 def _circles(count: int) -> list[Row]:

@@ -1,11 +1,10 @@
 """Corners of a target in photographs, each with its identity, to a small part of a pixel.
 
 A chessboard is found whole: the classic detector, the sector-based one where that fails. Of a
-ChArUco board any part is enough; corners whose markers were not read are predicted from their
-neighbours and kept if the picture shows the board there. A chessboard's corners are refined by
-Foerstner's gradient method in a window scaled to the local pitch, a ChArUco board's by fitting
-the rendered board (:mod:`chromeball.calibrate.patch`), circles by their centroids
-(:mod:`chromeball.calibrate.circles`).
+ChArUco board or an AprilGrid any part is enough (:mod:`chromeball.calibrate.coded`). Corners
+are measured by fitting the rendered board (:mod:`chromeball.calibrate.patch`), a chessboard's
+after Foerstner's gradient method in a window scaled to the local pitch; circles by their
+centroids (:mod:`chromeball.calibrate.circles`).
 """
 
 from __future__ import annotations
@@ -20,8 +19,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from chromeball.calibrate.aprilgrid import AprilGrid
 from chromeball.calibrate.circles import detect_circles
-from chromeball.calibrate.patch import BLURS, LEAST_CORRELATION, Board, fit_corner
+from chromeball.calibrate.coded import REACH, find_coded, is_mirrored
+from chromeball.calibrate.grow import Found, grow, likeness
+from chromeball.calibrate.patch import Board
 from chromeball.calibrate.target import Charuco, Chessboard, CircleGrid, Target
 from chromeball.scene.errors import UserError
 from chromeball.scene.image import Image, read_image, to_display
@@ -38,14 +40,17 @@ SEARCH_WIDTH = 1600
 class Detection:
     """What one picture shows of the target.
 
-    ``corners`` is (rows, columns, 2) in pixels, NaN where not found; ``size`` is width and
-    height; ``blur`` the standard deviation of the edges' spread in pixels, NaN without a board;
-    ``usable`` says that the view may enter a calibration, ``verdict`` why or why not.
+    ``corners`` is (rows, columns, 2) in pixels, NaN where not found; ``sigma`` (rows, columns)
+    the standard error of a coordinate from the picture's noise, NaN where it is not known;
+    ``size`` is width and height; ``blur`` the standard deviation of the edges' spread in
+    pixels, NaN without a board; ``usable`` says that the view may enter a calibration,
+    ``verdict`` why or why not.
     """
 
     file: Path
     size: tuple[int, int]
     corners: NDArray[np.float64]
+    sigma: NDArray[np.float64]
     blur: float
     usable: bool
     verdict: str
@@ -97,16 +102,22 @@ def detect_files(
 def judge(file: Path, picture: NDArray[np.uint8], target: Target) -> Detection:
     """Detect in one grey picture and say what came of it."""
     size = (picture.shape[1], picture.shape[0])
-    corners, blur = detect_with_blur(picture, target)
-    found = np.argwhere(np.isfinite(corners[..., 0]))
+    seen = look(picture, target)
+
+    def verdict(usable: bool, text: str) -> Detection:
+        return Detection(file, size, seen.corners, seen.sigma, seen.blur, usable, text)
+
+    found = np.argwhere(np.isfinite(seen.corners[..., 0]))
     if not len(found):
-        return Detection(file, size, corners, float("nan"), False, "no board")
-    verdict = f"{len(found)} of {target.count} corners, blur {blur:.1f} px"
+        if isinstance(target, Charuco | AprilGrid) and is_mirrored(picture, target):
+            return verdict(False, "the board is seen in a mirror: flip the picture")
+        return verdict(False, "no board")
+    text = f"{len(found)} of {target.count} corners, blur {seen.blur:.1f} px"
     spread = np.linalg.matrix_rank(found - found.mean(axis=0)) if len(found) > 1 else 0
     if len(found) < FEWEST or spread < 2:
         reason = "too few" if len(found) < FEWEST else "all in a line"
-        return Detection(file, size, corners, blur, False, f"{verdict}: {reason}")
-    return Detection(file, size, corners, blur, True, verdict)
+        return verdict(False, f"{text}: {reason}")
+    return verdict(True, text)
 
 
 def grey(image: Image) -> NDArray[np.uint8]:
@@ -124,23 +135,36 @@ def grey(image: Image) -> NDArray[np.uint8]:
     return np.asarray(cv2.cvtColor(np.ascontiguousarray(codes), cv2.COLOR_RGB2GRAY), np.uint8)
 
 
+@dataclass(frozen=True)
+class Seen:
+    """``corners`` (rows, columns, 2), ``sigma`` (rows, columns) and ``blur`` as of a
+    :class:`Detection`.
+    """  # noqa: D205
+
+    corners: NDArray[np.float64]
+    sigma: NDArray[np.float64]
+    blur: float
+
+
 def detect(picture: NDArray[np.uint8], target: Target) -> NDArray[np.float64]:
     """Corners of `target` in a grey picture, (rows, columns, 2), NaN where not found."""
-    return detect_with_blur(picture, target)[0]
+    return look(picture, target).corners
 
 
-def detect_with_blur(
-    picture: NDArray[np.uint8], target: Target
-) -> tuple[NDArray[np.float64], float]:
-    """As :func:`detect`, and the spread of edges, one standard deviation in pixels."""
+def look(picture: NDArray[np.uint8], target: Target) -> Seen:
+    """As :func:`detect`, with standard errors and the spread of edges."""
+    shape = (target.rows, target.columns)
+    nothing = np.full(shape, np.nan)
     if min(picture.shape) < 24:  # the detectors' filters need some room
-        return np.full((target.rows, target.columns, 2), np.nan), np.nan
-    if isinstance(target, Charuco):
-        return _detect_charuco(picture, target)
+        return Seen(np.full((*shape, 2), np.nan), nothing, np.nan)
     if isinstance(target, CircleGrid):
-        return detect_circles(picture, target)
-    corners = _detect_chessboard(picture, target)
-    return corners, _edge_blur(picture, corners)
+        corners, blur = detect_circles(picture, target)
+        return Seen(corners, nothing, blur)
+    if isinstance(target, Chessboard):
+        found = _fit_chessboard(picture, target, _detect_chessboard(picture, target))
+    else:
+        found = find_coded(picture, target)
+    return Seen(found.pixels.reshape(*shape, 2), found.sigma.reshape(shape), found.blur)
 
 
 # ---- chessboard
@@ -175,132 +199,20 @@ def _shrink(picture: NDArray[np.uint8], factor: float) -> NDArray[Any]:
     return cv2.resize(picture, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
 
 
-def _edge_blur(picture: NDArray[np.uint8], corners: NDArray[np.float64]) -> float:
-    """Spread of the squares' edges, one standard deviation in pixels, median over the board.
-
-    A step blurred by a Gaussian has contrast / largest slope = sqrt(2 pi) sigma.
-    """
-    sigmas: list[float] = []
-    for a, b in ((corners[:, :-1], corners[:, 1:]), (corners[:-1], corners[1:])):
-        middle, along = (a + b) / 2, b - a
-        length = np.linalg.norm(along, axis=-1)
-        for m, d, n in zip(
-            middle.reshape(-1, 2), along.reshape(-1, 2), length.ravel(), strict=True
-        ):
-            if not np.isfinite(n) or n < 8:
-                continue
-            half = min(0.35 * n, 20.0)
-            s = np.arange(-half, half + 0.125, 0.25)
-            normal = np.array([-d[1], d[0]]) / n
-            profile = _sample(picture, m + s[:, None] * normal)
-            slope = np.abs(np.diff(profile)).max() / 0.25
-            contrast = np.ptp(profile)
-            if contrast > 16:
-                sigmas.append(float(contrast / (np.sqrt(2 * np.pi) * slope)))
-    return float(np.median(sigmas)) if sigmas else float("nan")
-
-
-# ---- ChArUco
-
-
-def _detect_charuco(
-    picture: NDArray[np.uint8], target: Charuco
-) -> tuple[NDArray[np.float64], float]:
-    """Corners, and the blur that renders the board most like the picture."""
-    grid = np.full((target.rows, target.columns, 2), np.nan)
-    corners, ids = _read_markers(picture, target)
-    if ids is None or len(ids) < grid.size // 4:
-        # Blurred markers are read again with their edges raised; that is for reading alone.
-        soft = cv2.GaussianBlur(picture, (0, 0), 2.5)
-        again = _read_markers(
-            np.asarray(cv2.addWeighted(picture, 3, soft, -2, 0), np.uint8), target
-        )
-        if again[1] is not None and (ids is None or len(again[1]) > len(ids)):
-            corners, ids = again
-    if ids is None or len(ids) < 6:
-        return grid, np.nan
-    grid.reshape(-1, 2)[ids.ravel()] = corners.reshape(-1, 2)
-    board = Board(target.cells(), target.cells_per_square)
-    sigma = _fit_blur(picture, board, grid, BLURS)
-    while True:
-        found = np.isfinite(grid[..., 0]).sum()
-        grid = _fit_patches(picture, board, grid, sigma)
-        if np.isfinite(grid[..., 0]).sum() <= found:
-            break
-    # Once more, from neighbours that are all well placed now.
-    k = BLURS.index(sigma)
-    sigma = _fit_blur(picture, board, grid, BLURS[max(0, k - 1) : k + 2])
-    return _fit_patches(picture, board, grid, sigma), sigma
-
-
-def _fit_blur(
-    picture: NDArray[np.uint8],
-    board: Board,
-    grid: NDArray[np.float64],
-    blurs: tuple[float, ...],
-) -> float:
-    """The one of `blurs` whose patches correlate best, over a few corners of `grid`."""
-    found = np.argwhere(np.isfinite(grid[..., 0])).tolist()
-    places: list[tuple[int, int, NDArray[np.float64]]] = []
-    for row, column in found[:: max(1, len(found) // 6)]:
-        if (h := _neighbourhood(grid, row, column)) is not None:
-            places.append((row, column, h))
-    scores = [
-        sum(fit_corner(picture, board, (r, c), h, sigma)[1] for r, c, h in places)
-        for sigma in blurs
+def _fit_chessboard(
+    picture: NDArray[np.uint8], target: Chessboard, grid: NDArray[np.float64]
+) -> Found:
+    """The rendered board fitted to corners (rows, columns, 2) that are nearly right."""
+    places = target.points()[..., :2].reshape(-1, 2) / target.square
+    seen = np.isfinite(grid[..., 0]).ravel()
+    known, pixels = places[seen], grid.reshape(-1, 2)[seen]
+    pitch = float(np.median(_pitch(grid))) if seen.any() else 1.0
+    # The first square may be black or white.
+    boards = [
+        Board.of(cells, 1, REACH, pitch) for cells in (target.cells(), 255 - target.cells())
     ]
-    return blurs[int(np.argmax(scores))]
-
-
-def _fit_patches(
-    picture: NDArray[np.uint8], board: Board, grid: NDArray[np.float64], sigma: float
-) -> NDArray[np.float64]:
-    """Every corner with found neighbours fitted where they predict it; NaN where not seen."""
-    fitted = np.full_like(grid, np.nan)
-    for row, column in np.ndindex(grid.shape[:2]):
-        h = _neighbourhood(grid, row, column)
-        if h is None:
-            continue
-        place, correlation = fit_corner(picture, board, (row, column), h, sigma)
-        if correlation > LEAST_CORRELATION:
-            fitted[row, column] = place
-    return fitted
-
-
-def _read_markers(picture: NDArray[np.uint8], target: Charuco) -> tuple[Any, Any]:
-    """OpenCV's ChArUco detector, tuned to keep blurred, small and partly hidden markers."""
-    aruco: Any = cv2.aruco
-    search = aruco.DetectorParameters()
-    search.adaptiveThreshWinSizeMin = 5
-    search.adaptiveThreshWinSizeMax = max(25, min(picture.shape) // 12 | 1)
-    search.adaptiveThreshWinSizeStep = max(8, (search.adaptiveThreshWinSizeMax - 5) // 5)
-    search.minMarkerPerimeterRate = 0.01
-    search.polygonalApproxAccuracyRate = 0.05
-    search.minOtsuStdDev = 3.0
-    search.perspectiveRemovePixelPerCell = 8
-    search.perspectiveRemoveIgnoredMarginPerCell = 0.25
-    corner = aruco.CharucoParameters()
-    corner.minMarkers = 1
-    corner.tryRefineMarkers = True
-    detector = aruco.CharucoDetector(target.board(), corner, search)
-    corners, ids, _, _ = detector.detectBoard(picture)
-    return corners, ids
-
-
-def _neighbourhood(
-    grid: NDArray[np.float64], row: int, column: int
-) -> NDArray[np.float64] | None:
-    """Homography from (column, row, 1) to pixels by the nearest found corners but this one."""
-    found = np.argwhere(np.isfinite(grid[..., 0]))
-    distance = np.abs(found - [row, column]).max(axis=1)
-    found = found[(distance > 0) & (distance <= 3)]
-    distance = np.hypot(*(found - [row, column]).T)
-    near = found[np.argsort(distance, kind="stable")[:12]]
-    if len(near) < 5 or np.linalg.matrix_rank(near - near.mean(axis=0)) < 2:
-        return None
-    found_pixels = grid[near[:, 0], near[:, 1]]
-    h: Any = cv2.findHomography(near[:, ::-1].astype(float), found_pixels)[0]
-    return None if h is None or abs(np.linalg.det(h)) < 1e-12 else np.asarray(h, float)
+    board = max(boards, key=lambda b: likeness(picture, b, places, known, pixels))
+    return grow(picture, board, places, known, pixels)
 
 
 # ---- common
@@ -341,10 +253,3 @@ def _pitch(grid: NDArray[np.float64]) -> NDArray[np.float64]:
     known = np.isfinite(nearest)
     typical = float(np.median(nearest[known])) if known.any() else 20.0
     return np.where(known, nearest, typical)
-
-
-def _sample(picture: NDArray[np.uint8], points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Bilinear values at (N, 2) pixels."""
-    x, y = (np.ascontiguousarray(points[:, i : i + 1], np.float32) for i in range(2))
-    values = cv2.remap(picture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(values, float).ravel()

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chromeball.calibrate import solve_fisheye, solve_mrcal
+from chromeball.calibrate.aprilgrid import AprilGrid
 from chromeball.calibrate.lens_result import Lens
 from chromeball.calibrate.target import Target
 from chromeball.scene.errors import UserError
@@ -50,6 +51,11 @@ def calibrate_lens(
         )
     if model in solve_fisheye.MODELS:
         return solve_fisheye.solve_fisheye(corners, target, size, model)
+    if isinstance(target, AprilGrid):
+        raise UserError(
+            f"mrcal, which solves {model}, knows only boards of evenly spaced corners, "
+            "not an AprilGrid: take --model kb4"
+        )
     return solve_mrcal.solve_mrcal(corners, target, size, model, paths)
 
 

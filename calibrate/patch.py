@@ -9,74 +9,147 @@ counts, the markers' too.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-#: Half of the compared window, in pitches: all of it on the four squares about the corner.
-REACH = 0.45
 #: Supersampling of the rendered patch.
-FINE = 3
+FINE = 2
 #: Least correlation of picture and patch to believe in a corner.
 LEAST_CORRELATION = 0.85
+#: What a local homography may miss, one deviation: relative, and pixels at the window's edge;
+#: and the noise, in codes of full contrast, that this is weighed with.
+SHEAR = 0.03
+BEND = 0.1
+NOISE = 3.0
+#: Error of a noiseless corner, from rendering and interpolation, pixels.
+FLOOR = 0.005
 BLURS = (0.4, 0.7, 1.0, 1.4, 1.9, 2.5, 3.2, 4.0, 5.0)
 
 
 @dataclass(frozen=True)
 class Board:
-    """``cells`` as of a target, ``n`` of them a square; inner corner (0, 0) is at square 1."""
+    """``cells`` (h, w), ``n`` of them a square; the first corner is at square 1.
+
+    Cells are to be finer than pixels, see :meth:`of`. ``reach`` is half of the compared window,
+    in squares.
+    """
 
     cells: NDArray[np.uint8]
     n: int
+    reach: float
+
+    @classmethod
+    def of(cls, cells: NDArray[np.uint8], n: int, reach: float, pitch: float) -> Board:
+        """A target's `cells`, split so that about two are a pixel wide where a square is
+        `pitch` pixels: between their centres interpolated, edges are where they should be.
+        """  # noqa: D205
+        parts = max(1, round(2 * pitch / n))
+        return cls(np.kron(cells, np.ones((parts, parts), np.uint8)), n * parts, reach)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A corner's ``place`` (2,), pixels; the ``correlation`` of picture and patch; and the
+    standard error of a coordinate, ``sigma``, pixels, from the noise that the patch leaves.
+
+    The correlation is 0 where the fit is lost or the picture's border too near.
+    """  # noqa: D205
+
+    place: NDArray[np.float64]
+    correlation: float
+    sigma: float
 
 
 def fit_corner(
     picture: NDArray[np.uint8],
     board: Board,
-    corner: tuple[int, int],
+    corner: NDArray[np.float64],
     h: NDArray[np.float64],
-    sigma: float,
-) -> tuple[NDArray[np.float64], float]:
-    """Place of inner corner (row, column) near where `h` puts it, (2,), and the correlation.
+    blur: float,
+) -> Fit:
+    """The corner at `corner` (2,) on the board, in squares, near where `h` puts it.
 
-    `h` (3, 3) is the homography from (column, row, 1) to pixels about the corner, `sigma` the
-    picture's blur in pixels. The correlation is 0 where the fit is lost or the picture's border
-    too near.
+    `h` (3, 3) is the homography from (x, y, 1) on the board to pixels about the corner, `blur`
+    the spread of the picture's edges in pixels.
     """
     height, width = picture.shape
-    row, column = corner
     sides = np.array([[0, 0], [0.5, 0], [-0.5, 0], [0, 0.5], [0, -0.5]])
-    start, right, left, below, above = apply(h, np.array([column, row]) + sides)
+    start, right, left, below, above = apply(h, corner + sides)
     pitch = float(min(np.linalg.norm(right - left), np.linalg.norm(below - above)))
+    lost = Fit(start, 0.0, np.nan)
     if not np.isfinite(pitch):
-        return start, 0.0
+        return lost
     room = np.minimum(start, [width - 1, height - 1] - start).min() - 0.15 * pitch - 1
-    half = int(min(round(REACH * pitch), 24, np.floor(room)))
+    half = int(min(round(board.reach * pitch), 24, np.floor(room)))
     if half < 4:
-        return start, 0.0
-    patch = render_patch(board, h, start, half + 1, sigma)
+        return lost
+    patch = render_patch(board, h, start, half + 1, blur)
     dx = (patch[1:-1, 2:] - patch[1:-1, :-2]) / 2
     dy = (patch[2:, 1:-1] - patch[:-2, 1:-1]) / 2
     template = patch[1:-1, 1:-1]
-    basis = np.stack([np.ones_like(template), template, -dx, -dy], axis=-1).reshape(-1, 4)
-    solve = np.linalg.pinv(basis)
+    basis, prior = _basis(template, dx, dy), np.diag(_prior(half))
+    normal = basis.T @ basis
+    solve = np.linalg.solve(normal + NOISE**2 * prior, basis.T)
     place, correlation = _search(picture, template, start, round(0.15 * pitch) + 1)
     size = (2 * half + 1, 2 * half + 1)
     for _ in range(20):
         seen = cv2.getRectSubPix(picture, size, place.tolist(), patchType=cv2.CV_32F)
         values = np.asarray(seen, float).ravel()
-        offset, gain, *shift = (solve @ values).tolist()
-        step = np.array(shift) / gain if gain > 0 else np.array([np.inf, np.inf])
+        state = solve @ values
+        gain, shift = float(state[1]), state[2:4]
+        step = shift / gain if gain > 0 else np.array([np.inf, np.inf])
         place = place + step
         if not np.abs(place - start).max() < 0.25 * pitch + 1:
-            return start, 0.0
+            return lost
         if np.abs(step).max() < 1e-3:
-            rest = values - basis @ np.array([offset, gain, *shift])
+            rest = values - basis @ state
             correlation = float(np.sqrt(max(0.0, 1 - rest.var() / max(values.var(), 1e-9))))
-            return place, correlation
-    return place, min(correlation, LEAST_CORRELATION / 2)
+            noise = float(rest @ rest) / (len(rest) - basis.shape[1])
+            noise *= _interpolated(solve[2:4], place)
+            spread = noise * np.linalg.inv(gain**2 * normal + noise * prior)
+            sigma = np.hypot(np.sqrt((spread[2, 2] + spread[3, 3]) / 2), FLOOR)
+            return Fit(place, correlation, float(sigma))
+    return Fit(place, min(correlation, LEAST_CORRELATION / 2), np.nan)
+
+
+def _basis(
+    template: NDArray[np.float64], dx: NDArray[np.float64], dy: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Derivatives of values by offset, gain, shift, shear and bend, (N, 14).
+
+    Shear (4) and bend (6) are displacements linear and quadratic in the place in the window,
+    pixels at its edges: what the homography does not say of the lens's distortion.
+    """
+    half = len(template) // 2
+    y, x = np.mgrid[-half : half + 1, -half : half + 1] / half
+    terms = [np.ones_like(template), template, -dx, -dy]
+    terms += [-form * slope for form in (x, y, x * x, x * y, y * y) for slope in (dx, dy)]
+    return np.stack(terms, axis=-1).reshape(-1, 14)
+
+
+def _interpolated(weights: NDArray[np.float64], place: NDArray[np.float64]) -> float:
+    """How much more noise the shift has than the variance of interpolated values suggests.
+
+    `weights` (2, N) are those of the values in the shift. Between pixels a value is a mean of
+    four, which has less noise, but shares it with its neighbours.
+    """
+    side = math.isqrt(weights.shape[1])
+    x, y = (place - np.floor(place)).tolist()
+    kernel = np.outer([1 - y, y], [1 - x, x])
+    pixels = [
+        cv2.filter2D(w, -1, kernel, borderType=cv2.BORDER_CONSTANT)
+        for w in weights.reshape(2, side, side)
+    ]
+    return float(np.square(pixels).sum() / np.square(weights).sum() / np.square(kernel).sum())
+
+
+def _prior(half: int) -> NDArray[np.float64]:
+    """Inverse variances of the unknowns of :func:`_basis`, (14,); zero is nothing known."""
+    return np.array([0.0] * 4 + [(SHEAR * half) ** -2] * 4 + [BEND**-2] * 6)
 
 
 def render_patch(
@@ -95,12 +168,12 @@ def render_patch(
     cell_from_place = np.array([[n, 0, n - 0.5], [0, n, n - 0.5], [0, 0, 1.0]])
     # Beyond the board its outermost cells go on; they are hardly in reach.
     shade = cv2.warpPerspective(
-        board.cells,
+        board.cells.astype(np.float32),
         cell_from_place @ np.linalg.inv(h) @ pixel_from_fine,
         (count * FINE, count * FINE),
-        flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
+        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
         borderMode=cv2.BORDER_REPLICATE,
-    ).astype(np.float32)
+    )
     # Sensor pixels are FINE wide, and are a box blur of their own.
     fine = cv2.GaussianBlur(shade, (0, 0), max(sigma, 0.1) * FINE)
     coarse = cv2.resize(fine, (count, count), interpolation=cv2.INTER_AREA)

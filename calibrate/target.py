@@ -18,10 +18,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from chromeball.calibrate.aprilgrid import AprilGrid, Code
 from chromeball.scene.errors import UserError
 
 FORMS = (
-    "chessboard:9x6:0.025, charuco:9x6:0.04:0.03:4X4_50, circles:7x5:0.04 or acircles:4x11:0.02"
+    "chessboard:9x6:0.025, charuco:9x6:0.04:0.03:4X4_50, aprilgrid:6x6:0.088:0.3, "
+    "circles:7x5:0.04 or acircles:4x11:0.02"
 )
 
 
@@ -63,7 +65,8 @@ class Charuco:
     """A ChArUco board, Garrido-Jurado's markers in the white squares of a chessboard.
 
     ``across`` x ``down`` squares, of which (across - 1) x (down - 1) inner corners follow;
-    ``square`` and ``marker`` side in metres; ``dictionary`` as ``4X4_50``.
+    ``square`` and ``marker`` side in metres; ``dictionary`` as ``4X4_50``. ``legacy`` is the
+    layout of OpenCV before 4.6: with an even number of rows the upper left square is white.
     """
 
     across: int
@@ -71,6 +74,7 @@ class Charuco:
     square: float
     marker: float
     dictionary: str
+    legacy: bool = False
 
     @property
     def columns(self) -> int:
@@ -105,9 +109,26 @@ class Charuco:
 
         known: Any = cv2.aruco
         dictionary = known.getPredefinedDictionary(getattr(known, f"DICT_{self.dictionary}"))
-        return known.CharucoBoard(
+        board = known.CharucoBoard(
             (self.across, self.down), self.square, self.marker, dictionary
         )
+        board.setLegacyPattern(self.legacy)
+        return board
+
+    def outlines(self) -> NDArray[np.float64]:
+        """The markers' corners in squares from the first inner corner, (K, 4, 2), clockwise."""
+        corners = np.array(self.board().getObjPoints(), float)
+        return corners[..., :2] / self.square - 1
+
+    def code(self) -> Code:
+        """The markers in the order of :meth:`outlines`."""
+        board = self.board()
+        family, side = board.getDictionary(), self._bits()
+        bits = [
+            family.generateImageMarker(int(i), side)[1:-1, 1:-1] > 0
+            for i in board.getIds().ravel()
+        ]
+        return Code(np.array(bits), 1)
 
     @property
     def cells_per_square(self) -> int:
@@ -218,14 +239,16 @@ class CircleGrid:
         return grid
 
 
-type Target = Chessboard | Charuco | CircleGrid
+type Target = Chessboard | Charuco | AprilGrid | CircleGrid
 
 
 def parse_target(spec: str) -> Target:
     """Read ``chessboard:9x6:0.025``, ``charuco:9x6:0.04:0.03:4X4_50``, ``circles:7x5:0.04``.
 
     A chessboard is counted in inner corners, a ChArUco board in squares, across x down; sizes
-    are metres. ``acircles:4x11:0.02`` is OpenCV's asymmetric grid of circles.
+    are metres. ``aprilgrid:6x6:0.088:0.3`` is Kalibr's: tags, side of a tag, gap in sides of a
+    tag; with ``:1`` behind it the tags' rims are one bit wide, not two. ``acircles:4x11:0.02``
+    is OpenCV's asymmetric grid of circles.
 
     Raises
     ------
@@ -249,6 +272,8 @@ def parse_target(spec: str) -> Target:
                 raise UserError(f"{spec}: the marker must be smaller than its square")
             name = _dictionary(spec, dictionary, across * down // 2)
             return Charuco(across, down, side, inner, name)
+        case "aprilgrid", [count, side, spacing, *border]:
+            return _aprilgrid(spec, count, side, spacing, border)
         case (("circles" | "acircles"), [count, spacing]):
             across, down = _count(spec, count)
             least = 2 if kind == "acircles" else 3
@@ -257,6 +282,23 @@ def parse_target(spec: str) -> Target:
             return CircleGrid(across, down, _length(spec, spacing), kind == "acircles")
         case _:
             raise UserError(f"{spec!r} is no target; write {FORMS}")
+
+
+def _aprilgrid(spec: str, count: str, side: str, spacing: str, border: list[str]) -> AprilGrid:
+    across, down = _count(spec, count)
+    if not 4 <= across * down <= 587 or min(across, down) < 1:
+        raise UserError(f"{spec}: an AprilGrid has 4 to 587 tags")
+    try:
+        gap = float(spacing)
+    except ValueError as error:
+        raise UserError(
+            f"{spec}: {spacing!r} is no ratio of gap and tag, such as 0.3"
+        ) from error
+    if not 0.05 <= gap <= 1:
+        raise UserError(f"{spec}: the gap is 0.05 to 1 tag wide, not {spacing}")
+    if border not in ([], ["1"], ["2"]):
+        raise UserError(f"{spec}: a tag's rim is 1 or 2 bits wide")
+    return AprilGrid(across, down, _length(spec, side), gap, int(border[0]) if border else 2)
 
 
 def _grid(rows: int, columns: int, square: float) -> NDArray[np.float64]:

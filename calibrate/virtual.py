@@ -29,8 +29,14 @@ def photograph(
     """
     fine = 3
     n = target.cells_per_square
-    board = np.pad(target.cells(), max(n // 2, 1), constant_values=255)
     rim = max(n // 2, 1)
+    board = np.pad(target.cells(), rim, constant_values=255)
+    # Cells of about half a pixel, interpolated, so that edges are where they should be.
+    near = camera.project(camera_from_board.apply(target.points()))
+    pitch = float(np.nanmedian(np.linalg.norm(np.diff(near, axis=1), axis=-1)))
+    parts = max(1, round(2 * pitch / n)) if np.isfinite(pitch) else 1
+    board = np.kron(board, np.ones((parts, parts), np.uint8))
+    n, rim = n * parts, rim * parts
     rays = camera.unproject(camera.pixel_grid())
     width, height = camera.size
     # Rays are smooth, so that between pixel centres they are interpolated.
@@ -56,11 +62,14 @@ def photograph(
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = -o[2] / d[..., 2]
         place = o[:2] + distance[..., None] * d[..., :2]
-        cell = np.floor((place / target.square + 1) * n + rim)
+        cell = (place / target.square + 1) * n + rim
         hit = (distance > 0) & (cell >= 0).all(axis=-1)
         hit &= (cell < board.shape[::-1]).all(axis=-1)
-    column, row = (np.where(hit, cell[..., i], 0).astype(int) for i in range(2))
-    shade = np.where(hit, 30 + board[row, column] * (190 / 255), 110.0)
+    column, row = (np.where(hit, cell[..., i] - 0.5, 0).astype(np.float32) for i in range(2))
+    codes = cv2.remap(
+        board.astype(np.float32), column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
+    shade = np.where(hit, 30 + codes * (190 / 255), 110.0)
     picture = cv2.resize(
         cv2.GaussianBlur(shade, (0, 0), blur * fine), camera.size, interpolation=cv2.INTER_AREA
     )

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from chromeball.calibrate.detect import detect, detect_with_blur, judge
+from chromeball.calibrate.detect import detect, judge, look
 from chromeball.calibrate.lens import calibrate_lens
 from chromeball.calibrate.target import CircleGrid, parse_target
 from chromeball.calibrate.virtual import board_poses, photograph, project
@@ -60,14 +60,15 @@ def test_centres(target: CircleGrid, blur: float) -> None:
     kind = cv2.CALIB_CB_ASYMMETRIC_GRID if target.asymmetric else cv2.CALIB_CB_SYMMETRIC_GRID
     for pose, place in zip(poses, truth, strict=True):
         picture = photograph(target, CAMERA, pose, blur=blur)
-        corners, measured = detect_with_blur(picture, target)
+        found = look(picture, target)
+        corners, measured = found.corners, found.blur
         # A pixel's own width, interpolation and noise add to the edges' blur.
         assert measured == pytest.approx(np.hypot(blur, 0.5), rel=0.25)
         if not target.asymmetric:
             corners = same_way(corners, place)
         errors.append(np.linalg.norm(corners - place, axis=-1)[row, column])
-        found, raw = cv2.findCirclesGrid(picture, (target.across, target.down), flags=kind)
-        if found:
+        ok, raw = cv2.findCirclesGrid(picture, (target.across, target.down), flags=kind)
+        if ok:
             true = place[row, column]
             theirs.extend(
                 min(

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from chromeball.calibrate.detect import detect, detect_files, detect_with_blur, grey, judge
+from chromeball.calibrate.detect import detect, detect_files, grey, judge, look
 from chromeball.calibrate.target import Charuco, Chessboard, Target, parse_target
 from chromeball.calibrate.virtual import board_poses, photograph, project
 from chromeball.scene.camera import CameraModel
@@ -30,10 +30,10 @@ CAMERA = CameraModel(
 @pytest.mark.parametrize(
     ("target", "blur", "bound"),
     [
-        (CHESSBOARD, 0.6, 0.08),
-        (CHESSBOARD, 2.0, 0.1),
-        (CHARUCO, 0.6, 0.06),
-        (CHARUCO, 2.2, 0.06),
+        (CHESSBOARD, 0.6, 0.03),
+        (CHESSBOARD, 2.0, 0.06),
+        (CHARUCO, 0.6, 0.025),
+        (CHARUCO, 2.5, 0.035),
     ],
     ids=["chessboard", "blurred-chessboard", "charuco", "blurred-charuco"],
 )
@@ -44,11 +44,12 @@ def test_corners(target: Target, blur: float, bound: float) -> None:
     errors: list[NDArray[np.float64]] = []
     for i, pose in enumerate(poses):
         picture = photograph(target, CAMERA, pose, blur=blur, seed=i)
-        corners, measured = detect_with_blur(picture, target)
+        seen = look(picture, target)
+        corners = seen.corners
         if isinstance(target, Chessboard) and np.abs(corners - truth[i]).max() > 5:
             corners = corners[::-1, ::-1]  # a chessboard does not tell its two ends
-        # A pixel's own width and interpolation add to the edges' blur.
-        assert measured == pytest.approx(np.hypot(blur, 0.4), rel=0.25)
+        # Interpolation adds to the edges' blur.
+        assert seen.blur == pytest.approx(np.hypot(blur, 0.3), rel=0.25)
         errors.append(np.linalg.norm(corners - truth[i], axis=-1))
     found = np.isfinite(errors)
     assert found.mean() > 0.97

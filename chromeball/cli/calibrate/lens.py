@@ -34,6 +34,7 @@ def lens(
     target
         chessboard:9x6:0.025 (inner corners, square in metres),
         charuco:9x6:0.04:0.03:4X4_50 (squares, square and marker in metres, dictionary),
+        aprilgrid:6x6:0.088:0.3 (Kalibr's: tags, side of a tag in metres, gap in sides),
         circles:7x5:0.04 (dark discs, distance of their centres in metres) or
         acircles:4x11:0.02 (every second row shifted by 0.02; rows that far apart, discs in a
         row twice as far).
