@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bench import calibrate_fisheye, calibrate_targets
+from bench import calibrate_fisheye, calibrate_targets, calibrate_tracker
 from bench.row import Row
 from chromeball.calibrate.detect import detect
 from chromeball.calibrate.lens import calibrate_lens, pose_errors
@@ -31,6 +31,7 @@ def rows(quick: bool) -> list[Row]:
         *(_left() if DATA.is_dir() else []),
         *calibrate_fisheye.rows(quick),
         *calibrate_targets.rows(quick),
+        *calibrate_tracker.rows(quick),
     ]
 
 

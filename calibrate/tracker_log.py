@@ -242,10 +242,7 @@ def read_log(path: str | os.PathLike[str]) -> TrackerLog:
 
 
 def read_times(path: str | os.PathLike[str], files: Sequence[Path]) -> Array:
-    """When each of `files` was taken, seconds, (N,).
-
-    From a CSV with columns ``file, t``, found by their names, or from a take: its folder or its
-    ``take.json`` (the monotonic clock, or where a frame has none, wall time).
+    """When each of `files` was taken, seconds, (N,), as :func:`all_times` has it.
 
     Raises
     ------
@@ -253,18 +250,36 @@ def read_times(path: str | os.PathLike[str], files: Sequence[Path]) -> Array:
         When it cannot be read or says nothing of a picture.
 
     """
-    path = Path(path)
-    if path.is_dir() or path.name == "take.json":
-        known = _take_times(path)
-    else:
-        known = dict[str, float]()
-        for k, row in enumerate(_rows(path, "times")):
-            if not {"file", "t"} <= set(row):
-                raise UserError("needs columns file and t", file=path)
-            known[Path(str(row["file"])).name] = _number(row, "t", k, path)
+    known = all_times(path)
     if missing := [f for f in files if f.name not in known]:
         raise UserError(f"says nothing of {missing[0].name}", file=path)
     return np.array([known[f.name] for f in files])
+
+
+def all_times(path: str | os.PathLike[str]) -> dict[str, float]:
+    """Pictures' names and when they were taken, seconds.
+
+    From a CSV with columns ``file, t``, or from a take: its folder or its ``take.json`` (the
+    monotonic clock, or where a frame has none, wall time).
+
+    Raises
+    ------
+    UserError
+        When it cannot be read, or names a picture twice.
+
+    """
+    path = Path(path)
+    if path.is_dir() or path.name == "take.json":
+        return _take_times(path)
+    known: dict[str, float] = {}
+    for k, row in enumerate(_rows(path, "times")):
+        if not {"file", "t"} <= set(row):
+            raise UserError("needs columns file and t", file=path)
+        name = Path(str(row["file"])).name
+        if name in known:
+            raise UserError(f"names {name} twice", file=path)
+        known[name] = _number(row, "t", k, path)
+    return known
 
 
 def _take_times(path: Path) -> dict[str, float]:

@@ -22,6 +22,7 @@ from chromeball.calibrate.tracker_file import camera_poses, read_tracker
 from chromeball.calibrate.tracker_log import TrackerLog, read_log, right_jacobian, sample
 from chromeball.calibrate.virtual import board_poses, photograph
 from chromeball.cli.main import build_app
+from chromeball.envmap.stitch.directions import read_directions
 from chromeball.scene.camera import CameraModel
 from chromeball.scene.errors import UserError
 from chromeball.scene.pose import Pose
@@ -385,7 +386,11 @@ def test_any_text_is_a_log_or_refused(
     assert np.isfinite(log.positions).all()
 
 
-# ---- the command
+# ---- the commands
+
+
+def _on_wall(camera_from_board: Pose) -> Pose:
+    return Pose(np.diag([1.0, -1, -1]), np.zeros(3)) @ camera_from_board.inverse()
 
 
 def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -433,6 +438,23 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     truth = Z @ poses[2].inverse()
     np.testing.assert_allclose(there[0].translation, truth.translation, atol=0.01)
     assert 0 < sigma[0] < 0.05
+    assert output.with_name(record["figures"]["plots"]["differences"]).is_file()
+
+    # other pictures by the same tracker, and what envmap stitch makes of it
+    times.write_text("file,t\n2.png,2.45\n")
+    directions = tmp_path / "directions.json"
+    track = ["calibrate", "track", output, "--log", log, "--times", times, "-o", directions]
+    build_app()([str(w) for w in track], result_action="return_value")
+    prior = read_directions(directions, ["2"])
+    np.testing.assert_allclose(prior.rotations[0], truth.rotation, atol=0.02)
+    np.testing.assert_allclose(prior.sigma, sigma)
+    build_app()([str(w) for w in (*track, "--world", "wall")], result_action="return_value")
+    upright = read_json(directions)["frames"][0]["world_from_camera"]
+    # the camera stands before the board, which faces +z
+    np.testing.assert_allclose(upright, _on_wall(poses[2]).matrix(), atol=0.03)
+    times.write_text("file,t\n2.png,99\n")
+    with pytest.raises(UserError, match="does not cover picture 1"):
+        build_app()([str(w) for w in track], result_action="return_value")
     times.write_text("file,t\n0.png,1\n")
     for more, message in (
         (["--delay", 0], r"says nothing of 1\.png"),

@@ -10,7 +10,7 @@ from cyclopts import Parameter
 
 from chromeball.cli.calibrate.arguments import Json, Out, print_figures, say
 from chromeball.scene.errors import UserError
-from chromeball.scene.record import Stage
+from chromeball.scene.record import Stage, atomic_output
 
 
 def tracker(
@@ -69,6 +69,7 @@ def tracker(
     from chromeball.calibrate.tracker import solve_tracker
     from chromeball.calibrate.tracker_file import figures, write_tracker
     from chromeball.calibrate.tracker_log import TrackerLog, read_log, read_times
+    from chromeball.calibrate.tracker_plot import plot_differences
     from chromeball.scene.camera import CameraModel
 
     for name, value in (
@@ -139,6 +140,10 @@ def tracker(
             tell=say,
         )
         stage.figures.update(figures(found, images))
+        plot = output.with_name(f"{output.stem}.differences.png")
+        with atomic_output(plot) as temporary:
+            plot_differences(found, images, temporary)
+        stage.figures["plots"] = {"differences": plot.name}
         with stage.output(output) as temporary:
             write_tracker(temporary, found)
     if json:

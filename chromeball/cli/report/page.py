@@ -55,6 +55,7 @@ DEEDS = {
     "calibrate match": "Focal length and pose of the camera that took one picture.",
     "calibrate exif": "A camera by a picture's metadata alone.",
     "calibrate realign": "The virtual scene turned onto the photograph by pairs of points.",
+    "calibrate track": "Where the camera was in each picture, by the tracker.",
     "calibrate tracker": "Where the camera sits on a tracker's sensor, and its delay.",
     "stand-in build": "Stand-in geometry of the real place, as drawn on the panorama.",
     "stand-in depth": "How far away the light of each direction comes from.",
