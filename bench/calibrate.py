@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from bench import calibrate_fisheye, calibrate_targets, calibrate_tracker
 from bench.row import Row
+from chromeball.calibrate.choose import pose_errors
 from chromeball.calibrate.detect import detect
-from chromeball.calibrate.lens import calibrate_lens, pose_errors
+from chromeball.calibrate.lens import calibrate_lens
 from chromeball.calibrate.target import Chessboard, CircleGrid
 from chromeball.calibrate.virtual import board_poses, photograph, project
 from chromeball.scene.camera import CameraModel

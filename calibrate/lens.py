@@ -1,26 +1,33 @@
-"""One lens from pictures of a target: the models, which one predicts best, by which solver.
+"""One lens from pictures of a target, of any model.
 
-mrcal solves OpenCV's models and its own splined one, our own least squares the fisheyes.
-Source: Zhang 2000 for what pictures of a plane determine.
+Our own least squares finds the lens and the corners that count; mrcal then refines OpenCV's
+models and solves its own splined one. Source: Zhang 2000 for what pictures of a plane
+determine.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from chromeball.calibrate import solve_fisheye, solve_mrcal
+from chromeball.calibrate import solve_mrcal
 from chromeball.calibrate.aprilgrid import AprilGrid
-from chromeball.calibrate.lens_result import Lens
+from chromeball.calibrate.convert import parameters
+from chromeball.calibrate.lens_result import Lens, check_count
+from chromeball.calibrate.solve import (
+    FISHEYES,
+    Fit,
+    fit_model,
+    fit_start,
+    judge,
+)
 from chromeball.calibrate.target import Target
 from chromeball.scene.errors import UserError
 
-MODELS = ("auto", *solve_mrcal.MODELS, *solve_fisheye.MODELS)
-#: What `auto` chooses from.
-CANDIDATES = ("opencv4", "opencv5", "opencv8", "kb4")
+OPENCV = ("opencv4", "opencv5", "opencv8")
+MODELS = ("auto", "pinhole", *OPENCV, "splined", *FISHEYES)
 FEWEST_VIEWS = 3
 
 
@@ -30,11 +37,13 @@ def calibrate_lens(
     size: tuple[int, int],
     model: str = "opencv8",
     paths: Sequence[str] | None = None,
+    start: Fit | None = None,
 ) -> Lens:
     """Estimate a lens from `corners` (V, rows, columns, 2), NaN where missing.
 
     `size` is the pictures' width and height; `paths` are kept in mrcal's solution for its
-    tools. `model` is one of :data:`MODELS` without ``auto``.
+    tools. `model` is one of :data:`MODELS` without ``auto``; `start` one of the same lens, if
+    there is one already.
 
     Raises
     ------
@@ -49,78 +58,21 @@ def calibrate_lens(
             f"the board was found in {_count(len(corners), 'picture')}; a lens needs "
             f"{FEWEST_VIEWS}, better 15, with the board tilted in different directions"
         )
-    if model in solve_fisheye.MODELS:
-        return solve_fisheye.solve_fisheye(corners, target, size, model)
-    if isinstance(target, AprilGrid):
-        raise UserError(
-            f"mrcal, which solves {model}, knows only boards of evenly spaced corners, "
-            "not an AprilGrid: take --model kb4"
-        )
-    return solve_mrcal.solve_mrcal(corners, target, size, model, paths)
-
-
-def choose_model(
-    corners: NDArray[np.float64],
-    target: Target,
-    size: tuple[int, int],
-    progress: Callable[[str, float], object] | None = None,
-) -> tuple[str, dict[str, float]]:
-    """The model of :data:`CANDIDATES` with the least held-out error, and all their errors.
-
-    The error of a model that these corners do not determine, or that does not reach them, is
-    infinite.
-
-    Raises
-    ------
-    UserError
-        When that is so of all of them.
-
-    """
-    errors: dict[str, float] = {}
-    refusal: UserError | None = None
-    for model in CANDIDATES:
-        try:
-            errors[model] = held_out_error(corners, target, size, model)
-        except UserError as error:
-            errors[model], refusal = math.inf, error
-        if progress is not None:
-            progress(model, errors[model])
-    if refusal is not None and math.isinf(min(errors.values())):
-        raise refusal
-    return min(errors, key=errors.__getitem__), errors
-
-
-def held_out_error(
-    corners: NDArray[np.float64],
-    target: Target,
-    size: tuple[int, int],
-    model: str,
-    folds: int = 4,
-) -> float:
-    """Root median square of held-out views' RMS per point, pixels.
-
-    Every view is left out once; its pose alone is fitted to the lens of the others. The median
-    keeps a view that the detector misread from deciding.
-    """
-    errors: list[float] = []
-    for fold in range(folds):
-        left_out = np.arange(len(corners)) % folds == fold
-        if not left_out.any():
-            continue
-        lens = calibrate_lens(corners[~left_out], target, size, model)
-        errors.extend(pose_errors(lens, corners[left_out], target))
-    return float(np.median(errors))
-
-
-def pose_errors(
-    lens: Lens, corners: NDArray[np.float64], target: Target
-) -> NDArray[np.float64]:
-    """RMS per point of views (V, rows, columns, 2) whose poses alone are fitted, (V,).
-
-    Infinite where the lens allows no pose.
-    """
-    square = (lens.pose_residuals(corners, target) ** 2).sum(axis=-1)
-    return np.sqrt([np.nanmean(s) if np.isfinite(s).any() else np.inf for s in square])
+    name = f"LENSMODEL_{model.upper()}" if model in OPENCV else model
+    check_count(corners, model, 4 if model == "splined" else parameters(name))
+    start = fit_start(corners, target, size) if start is None else start
+    if model == "splined":
+        if isinstance(target, AprilGrid):
+            raise UserError(
+                "mrcal, which solves splined, knows only boards of evenly spaced corners, not "
+                "an AprilGrid: take another model"
+            )
+        start = fit_model(start, corners, target, "kb4")
+        return solve_mrcal.solve_splined(start, corners, target, paths)
+    fit = fit_model(start, corners, target, name)
+    if model in FISHEYES or isinstance(target, AprilGrid):
+        return judge(fit, corners, target)
+    return solve_mrcal.refine(fit, corners, target, paths)
 
 
 def _count(n: int, noun: str) -> str:

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import math
 import os
-from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from chromeball.calibrate.adjust import gradients
-from chromeball.calibrate.target import Target
+from chromeball.calibrate.uncertainty import projection_covariance, worst_direction
 from chromeball.scene.camera import CameraModel
 from chromeball.scene.errors import UserError
 from chromeball.scene.pose import Pose
+from chromeball.scene.record import write_text
 
 #: Boards must differ by this angle somewhere, else they do not determine a focal length.
 LEAST_TILT = math.radians(5)
@@ -26,10 +26,11 @@ PARALLEL = (
 )
 #: Relative standard error of the focal length beyond which a calibration is no calibration.
 WORST_FOCAL = 0.05
+OPENCV_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 
 
 @dataclass(frozen=True)
-class Lens(ABC):
+class Lens:
     """A calibrated lens with all that tells how good it is.
 
     V views of a board of R x C corners; pixels throughout, NaN where there is no corner.
@@ -37,8 +38,11 @@ class Lens(ABC):
     outliers; ``outliers`` (V, R, C). ``rms`` per point over inliers; ``sigma`` the estimated
     standard deviation of one coordinate of a corner, freed from the fitted unknowns.
     ``covariance`` (k, k) of the intrinsics. ``bow`` (2,) the board's deflection, metres along x
-    and y. ``camera_from_board`` (V, 6), rotation vector and translation; NaN for a view that
-    was misread.
+    and y; ``pupil`` (2,) the travel of the entrance pupil, metres, zeros where it stands
+    (:class:`chromeball.calibrate.adjust.Estimate`). ``camera_from_board`` (V, 6), rotation
+    vector and translation; NaN for a view that was misread. ``condition`` of the normal
+    equations; ``solution``, mrcal's camera model with its optimisation inputs where mrcal found
+    it.
     """
 
     camera: CameraModel
@@ -49,24 +53,30 @@ class Lens(ABC):
     sigma: float
     covariance: NDArray[np.float64]
     bow: NDArray[np.float64]
+    pupil: NDArray[np.float64]
     camera_from_board: NDArray[np.float64]
+    condition: float
+    solution: Any = None
 
     @property
-    @abstractmethod
     def names(self) -> tuple[str, ...]:
         """Names of the intrinsics."""
+        model, count = self.camera.model, len(self.camera.intrinsics)
+        if model.startswith("kb4"):
+            return ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2")[:count]
+        if model.startswith("LENSMODEL_SPLINED"):
+            return (*OPENCV_NAMES[:4], *(f"s{i}" for i in range(count - 4)))
+        return OPENCV_NAMES[:count] if count > 3 else ("f", "cx", "cy")
 
-    @abstractmethod
-    def pose_residuals(
-        self, corners: NDArray[np.float64], target: Target
-    ) -> NDArray[np.float64]:
-        """Projected minus observed `corners` (V, rows, columns, 2) of views that the lens was
-        not made of; their poses alone are fitted. NaN where there is no corner, or no pose.
-        """  # noqa: D205
-
-    @abstractmethod
     def write(self, path: str | os.PathLike[str]) -> None:
-        """Write the ``.cameramodel``."""
+        """Write the ``.cameramodel``, with what mrcal's solution was made of."""
+        known = replace(self.camera, covariance=self.covariance, region=_closed(self.hull()))
+        if self.solution is None:
+            known.write(path)
+            return
+        self.solution.write(os.fspath(path), note=f"RMS {self.rms:.4f} px per point")
+        text = Path(path).read_text()
+        write_text(path, text[: text.rindex("}")] + known.text_of_knowledge() + "}\n")
 
     @property
     def standard_errors(self) -> NDArray[np.float64]:
@@ -105,7 +115,7 @@ class Lens(ABC):
         return float(cv2.contourArea(self.hull()) / (self.camera.size[0] * self.camera.size[1]))
 
     def hull(self) -> NDArray[np.float32]:
-        """Convex hull of the corners that were used, (N, 2)."""
+        """Convex hull of the corners that were used, (N, 2), pixels."""
         import cv2
 
         seen = self._used_corners()
@@ -125,28 +135,15 @@ class Lens(ABC):
         rows = max(2, round(columns * height / width))
         x, y = np.meshgrid(np.linspace(0, width - 1, columns), np.linspace(0, height - 1, rows))
         pixels = np.stack([x, y], axis=-1)
-        variance = self.projection_covariance(self._rays(pixels))
-        # The larger eigenvalue of [[a, b], [b, c]].
-        a, b, c = variance[..., 0, 0], variance[..., 0, 1], variance[..., 1, 1]
-        return pixels, np.sqrt((a + c) / 2 + np.hypot((a - c) / 2, b))
+        return pixels, worst_direction(self.projection_covariance(self._rays(pixels)))
 
     def projection_covariance(self, rays: NDArray[np.float64]) -> NDArray[np.float64]:
         """Covariance (..., 2, 2) of where points at infinity along unit `rays` are seen, px^2.
 
-        Other intrinsics look like a turned camera in part, which no use of the lens minds: the
-        turn w that fits best over the corners is taken out, dq = dq/di di + dq/dp (w x p). It
-        is the error from corner noise alone; what the model cannot express is not in it.
+        See :func:`chromeball.calibrate.uncertainty.projection_covariance`.
         """
-        by_turn, by_intrinsics = self._sensitivity(self._rays(self._used_corners()))
-        known = np.isfinite(by_turn).all(axis=(1, 2))
-        w = -np.linalg.lstsq(
-            by_turn[known].reshape(-1, 3),
-            by_intrinsics[known].reshape(-1, len(self.covariance)),
-            rcond=None,
-        )[0]
-        by_turn, by_intrinsics = self._sensitivity(rays)
-        j = by_intrinsics + by_turn @ w
-        return np.asarray(j @ self.covariance @ np.swapaxes(j, -1, -2), float)
+        support = self._rays(self._used_corners())
+        return projection_covariance(self.camera, self.covariance, support, rays)
 
     def figures(self) -> dict[str, Any]:
         """Figures of quality for the record."""
@@ -163,11 +160,13 @@ class Lens(ABC):
         return {
             "rms": self.rms,
             "sigma": self.sigma,
+            "condition": self.condition,
             "corners": int(np.isfinite(self.observed[..., 0]).sum()),
             "outliers": int(self.outliers.sum()),
             "intrinsics": dict(zip(self.names, self.camera.intrinsics, strict=True)),
             "standard_errors": dict(zip(self.names, self.standard_errors, strict=True)),
             "bow_metres": self.bow,
+            "pupil_metres": self.pupil,
             "fov_degrees": np.degrees(self.field_of_view()),
             "true_fov_degrees": np.degrees(self.true_field_of_view()),
             "coverage": self.coverage(),
@@ -186,13 +185,6 @@ class Lens(ABC):
     def _used_corners(self) -> NDArray[np.float64]:
         return self.observed[np.isfinite(self.residuals[..., 0])]
 
-    def _sensitivity(
-        self, rays: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """D pixel / d turn (..., 2, 3) and d pixel / d intrinsics (..., 2, k)."""
-        _, by_point, by_intrinsics = gradients(self.camera, np.ascontiguousarray(rays))
-        return np.cross(rays[..., None, :], by_point), by_intrinsics
-
     def _rays(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
         """Unit rays, NaN where they do not project back: there the lens model folds."""
         rays = self.camera.unproject(pixels)
@@ -200,6 +192,10 @@ class Lens(ABC):
             miss = np.linalg.norm(self.camera.project(rays) - pixels, axis=-1)
             rays[~(miss < 0.1)] = np.nan
         return rays
+
+
+def _closed(outline: NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.concatenate([outline, outline[:1]])
 
 
 def largest_tilt(camera_from_board: NDArray[np.float64]) -> float:

@@ -133,13 +133,18 @@ def project(
     noise: float = 0.0,
     seed: int = 0,
     bow: float = 0.0,
+    pupil: float = 0.0,
 ) -> NDArray[np.float64]:
     """Corners (V, rows, columns, 2) of a board bowed by `bow` metres along its rows.
 
-    `noise` is the standard deviation of a coordinate in pixels.
+    `noise` is the standard deviation of a coordinate in pixels; the entrance pupil travels by
+    `pupil` metres times the square of the angle from the axis.
     """
     points = target.points()
     x = np.linspace(-1, 1, target.columns)
     points[..., 2] += bow * (1 - x**2)
-    corners = np.array([camera.project(pose.apply(points)) for pose in poses])
+    seen = np.array([pose.apply(points) for pose in poses])
+    theta = np.arctan2(np.hypot(seen[..., 0], seen[..., 1]), seen[..., 2])
+    seen[..., 2] -= pupil * theta**2
+    corners = camera.project(seen)
     return corners + np.random.default_rng(seed).normal(0, noise, corners.shape)

@@ -50,7 +50,7 @@ _FISHEYE: dict[str, tuple[Radial, Radial, Radial, float]] = {
     ),
 }
 FISHEYE_MODELS = (*_FISHEYE, "kb4")
-MODELS = ("pinhole", *FISHEYE_MODELS, "latlong", "cube")
+MODELS = ("pinhole", *FISHEYE_MODELS, "kb4_decentred", "latlong", "cube")
 
 #: Faces of the cube in camera axes: forward, right, down, and column and row in the cross.
 CUBE_FACES: tuple[tuple[tuple[int, int, int], ...], ...] = (
@@ -70,13 +70,18 @@ class CameraModel:
     ``model``
         ``pinhole`` (fx fy cx cy); ``equidistant``, ``equisolid``, ``stereographic``,
         ``orthographic`` (f cx cy); ``kb4``, Kannala and Brandt 2006 (fx fy cx cy k1 k2 k3 k4,
-        r = theta + k1 theta^3 + ...); ``latlong`` and ``cube`` (none): a cube is a horizontal
-        cross, 4:3, forward in its second column and the back in the last, up and down about
+        r = theta + k1 theta^3 + ...); ``kb4_decentred``, the same with p1 p2 for elements
+        off the axis (COLMAP's thin-prism fisheye without the prism); ``latlong`` and ``cube``
+        (none): a cube is a horizontal cross, 4:3, forward in its second column and the back in
+        the last, up and down about
         forward; or one of mrcal's names, ``LENSMODEL_...``, with mrcal's intrinsics.
     ``size``
         Width and height in pixels.
     ``max_angle``
         Largest angle from the optical axis that a fisheye sees, radians.
+    ``covariance``, ``region``
+        Of a calibrated lens: the intrinsics' covariance (k, k), and the corners (N, 2) of the
+        part of the picture that was calibrated, pixels, the first also the last.
     """
 
     model: str
@@ -84,6 +89,8 @@ class CameraModel:
     size: tuple[int, int]
     world_from_camera: Pose = field(default_factory=Pose.identity)
     max_angle: float = math.pi
+    covariance: NDArray[np.float64] | None = None
+    region: NDArray[np.floating[Any]] | None = None
 
     def __post_init__(self) -> None:
         values = np.array(self.intrinsics, float).reshape(-1)
@@ -96,7 +103,8 @@ class CameraModel:
             except (RuntimeError, TypeError) as error:
                 raise UserError(f"mrcal knows no lens model {self.model!r}") from error
         elif self.model in MODELS:
-            expected = {"pinhole": 4, "kb4": 8, "latlong": 0, "cube": 0}.get(self.model, 3)
+            known = {"pinhole": 4, "kb4": 8, "kb4_decentred": 10, "latlong": 0, "cube": 0}
+            expected = known.get(self.model, 3)
         else:
             raise UserError(f"unknown camera model {self.model!r}; one of {', '.join(MODELS)}")
         if len(values) != expected:
@@ -173,7 +181,7 @@ class CameraModel:
             name = "LENSMODEL_PINHOLE" if self.model == "pinhole" else self.model
             q, dq_dp, _ = mrcal.project(p, name, self.intrinsics, get_gradients=True)
             q, dq_dp = np.array(q, float), np.array(dq_dp, float)
-            if not _sees_behind(name):
+            if not sees_behind(name):
                 behind = p[..., 2] <= 0
                 q[behind], dq_dp[behind] = np.nan, np.nan
             return q, dq_dp
@@ -205,11 +213,13 @@ class CameraModel:
         if self.model == "cube":
             return self._unproject_cube(q)
         fx, fy, cx, cy, _ = self._fisheye_parameters()
-        x, y = ((q.reshape(-1, 2) - [cx, cy]) / [fx, fy]).T
-        r = np.hypot(x, y)
-        theta = self._angle(r)
-        scale = np.where(r > 0, np.sin(theta) / np.where(r > 0, r, 1), 1.0)
-        d = np.stack([x * scale, y * scale, np.cos(theta)], axis=-1)
+        plane = (q.reshape(-1, 2) - [cx, cy]) / [fx, fy]
+        theta, along = self._angle_along(plane)
+        if self.model == "kb4_decentred":
+            for _ in range(10):  # each round leaves a hundredth of the error or less
+                off, _ = self._decentring(theta[:, None] * along)
+                theta, along = self._angle_along(plane - off)
+        d = np.concatenate([np.sin(theta)[:, None] * along, np.cos(theta)[:, None]], axis=-1)
         d[~(theta <= self.max_angle * (1 + 1e-9))] = np.nan
         return d.reshape(*q.shape[:-1], 3)
 
@@ -232,14 +242,20 @@ class CameraModel:
     def scaled(self, factor: float) -> CameraModel:
         """The same lens on a sensor with `factor` times as many pixels a side."""
         size = (round(self.size[0] * factor), round(self.size[1] * factor))
-        values = self.intrinsics.copy()
-        if self.model not in ("latlong", "cube"):
-            focal = 1 if self.model in _FISHEYE else 2
-            sx, sy = size[0] / self.size[0], size[1] / self.size[1]
-            values[:focal] *= [sx] if focal == 1 else [sx, sy]
-            values[focal] = (values[focal] + 0.5) * sx - 0.5
-            values[focal + 1] = (values[focal + 1] + 0.5) * sy - 0.5
-        return replace(self, intrinsics=values, size=size)
+        if self.model in ("latlong", "cube"):
+            return replace(self, size=size)
+        focal = 1 if self.model in _FISHEYE else 2
+        sx, sy = size[0] / self.size[0], size[1] / self.size[1]
+        by = np.ones(len(self.intrinsics))
+        by[: focal + 2] = [sx, sx, sy] if focal == 1 else [sx, sy, sx, sy]
+        values = self.intrinsics * by
+        values[focal : focal + 2] += [(sx - 1) / 2, (sy - 1) / 2]
+        covariance, region = self.covariance, self.region
+        if covariance is not None:
+            covariance = by[:, None] * covariance * by
+        if region is not None:
+            region = (region + 0.5) * [sx, sy] - 0.5
+        return replace(self, intrinsics=values, size=size, covariance=covariance, region=region)
 
     # ---- files, in mrcal's text format
 
@@ -262,6 +278,8 @@ class CameraModel:
                 (width, height),
                 Pose.from_rotation_vector(rt[:3], rt[3:]).inverse(),
                 float(value.get("max_angle", math.pi)),
+                _knowledge(value, "intrinsics_covariance", len(value["intrinsics"])),
+                _knowledge(value, "valid_intrinsics_region", 2),
             )
         except FileNotFoundError as error:
             raise UserError("no such camera model", file=path) from error
@@ -297,9 +315,22 @@ class CameraModel:
             f"    'rt_cam_ref': [ {', '.join(repr(float(v)) for v in rt)} ],",
             f"    'imagersize': [ {self.size[0]}, {self.size[1]} ],",
         ]
-        if self.model in FISHEYE_MODELS:
+        if self.model in (*FISHEYE_MODELS, "kb4_decentred"):
             lines.append(f"    'max_angle':  {self.max_angle!r},")
-        return "{\n" + "\n".join(lines) + "\n}\n"
+        return "{\n" + "\n".join(lines) + "\n" + self.text_of_knowledge() + "}\n"
+
+    def text_of_knowledge(self) -> str:
+        """The lines of ``.cameramodel`` that say how well the lens is known, if it is known."""
+        known = {
+            "intrinsics_covariance": self.covariance,
+            "valid_intrinsics_region": self.region,
+        }
+        lines = [
+            f"    '{name}': [{', '.join(_numbers(row) for row in rows)}],\n"
+            for name, rows in known.items()
+            if rows is not None
+        ]
+        return "".join(lines)
 
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write the ``.cameramodel``, whole or not at all."""
@@ -308,9 +339,9 @@ class CameraModel:
     # ---- formulas
 
     def _fisheye_parameters(self) -> tuple[float, float, float, float, NDArray[np.float64]]:
-        if self.model == "kb4":
+        if self.model.startswith("kb4"):
             fx, fy, cx, cy = self.intrinsics[:4]
-            return fx, fy, cx, cy, self.intrinsics[4:]
+            return fx, fy, cx, cy, self.intrinsics[4:8]
         f, cx, cy = self.intrinsics
         return f, f, cx, cy, np.zeros(0)
 
@@ -318,8 +349,8 @@ class CameraModel:
         self, theta: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Distance from the principal point over f, and its derivative."""
-        if self.model == "kb4":
-            k = self.intrinsics[4:]
+        if self.model.startswith("kb4"):
+            k = self.intrinsics[4:8]
             powers = np.stack([theta ** (2 * i + 1) for i in range(5)], axis=-1)
             slopes = np.stack([(2 * i + 1) * theta ** (2 * i) for i in range(5)], axis=-1)
             coefficients = np.concatenate([[1.0], k])
@@ -329,7 +360,7 @@ class CameraModel:
 
     def _angle(self, r: NDArray[np.float64]) -> NDArray[np.float64]:
         """Inverse of `_radius`; NaN where the lens has no such radius."""
-        if self.model != "kb4":
+        if not self.model.startswith("kb4"):
             limit = _FISHEYE[self.model][3]
             rim = _FISHEYE[self.model][0](np.float64(min(limit, math.pi)))
             return np.where(r <= rim, _FISHEYE[self.model][1](r), np.nan)
@@ -343,6 +374,30 @@ class CameraModel:
             radius, slope = self._radius(theta)
             theta = theta - (radius - r) / slope
         return theta
+
+    def _angle_along(
+        self, plane: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Angle (N,) and unit direction in the picture (N, 2) of places (N, 2) over f."""
+        r = np.hypot(plane[:, 0], plane[:, 1])
+        return self._angle(r), plane / np.where(r > 0, r, 1)[:, None]
+
+    def _decentring(
+        self, uv: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """What p1 and p2 add at angle times direction (N, 2), and its derivative (N, 2, 2)."""
+        p1, p2 = self.intrinsics[8:]
+        u, v = uv[:, 0], uv[:, 1]
+        add = np.stack(
+            [
+                2 * p1 * u * v + p2 * (3 * u * u + v * v),
+                2 * p2 * u * v + p1 * (u * u + 3 * v * v),
+            ],
+            axis=-1,
+        )
+        across = 2 * (p1 * u + p2 * v)
+        rows = [6 * p2 * u + 2 * p1 * v, across, across, 2 * p2 * u + 6 * p1 * v]
+        return add, np.stack(rows, axis=-1).reshape(-1, 2, 2)
 
     def _project_fisheye(
         self, p: NDArray[np.float64]
@@ -377,7 +432,21 @@ class CameraModel:
             ],
             axis=-1,
         )
-        jacobian = np.stack([fx * dx, fy * dy], axis=-2)
+        jacobian = np.stack([dx, dy], axis=-2)
+        if self.model == "kb4_decentred":
+            # u = theta x / rho: an equidistant lens in place of r(theta).
+            flat = np.where(on_axis, 1 / np.where(z == 0, np.nan, z), theta / safe)
+            add, slopes = self._decentring(flat[:, None] * p[:, :2])
+            along = np.stack([ux, uy], axis=-1)
+            outer = along[:, :, None] * along[:, None, :]
+            by_xy = (z / norm2)[:, None, None] * outer + flat[:, None, None] * (
+                np.eye(2) - outer
+            )
+            by_z = -(rho / norm2)[:, None] * along
+            by = np.concatenate([by_xy, by_z[:, :, None]], axis=-1)
+            q = q + [fx, fy] * add
+            jacobian = jacobian + slopes @ by
+        jacobian = np.array([fx, fy])[:, None] * jacobian
         unseen = ~(theta <= self.max_angle * (1 + 1e-9)) | (norm2 == 0)
         q[unseen], jacobian[unseen] = np.nan, np.nan
         return q, jacobian
@@ -432,7 +501,21 @@ class CameraModel:
         return q, jacobian
 
 
-def _sees_behind(lensmodel: str) -> bool:
+def _numbers(row: NDArray[np.floating[Any]]) -> str:
+    return "[" + ", ".join(f"{float(v):.9g}" for v in row) + "]"
+
+
+def _knowledge(value: dict[str, Any], name: str, columns: int) -> NDArray[np.float64] | None:
+    """A table of numbers (N, columns) of a .cameramodel; None where it has none."""
+    if value.get(name) is None or not len(value[name]):
+        return None
+    table = np.array(value[name], float)
+    if table.ndim != 2 or table.shape[1] != columns or not np.isfinite(table).all():
+        raise UserError(f"{name} is no table of {columns} columns")
+    return table
+
+
+def sees_behind(lensmodel: str) -> bool:
     """Whether one of mrcal's lens models is defined beyond 90 degrees."""
     return lensmodel.startswith(
         ("LENSMODEL_STEREOGRAPHIC", "LENSMODEL_LATLON", "LENSMODEL_LONLAT", "LENSMODEL_SPLINED")

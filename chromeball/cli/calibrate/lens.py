@@ -40,20 +40,22 @@ def lens(
         row twice as far).
     model
         pinhole, opencv4, opencv5, opencv8, splined; kb4 for fisheyes beyond 180 degrees, too
-        (Kannala and Brandt), equidistant, equisolid, stereographic; or auto: the one of
-        opencv4, opencv5, opencv8 and kb4 with the least error on pictures left out of the
-        solution.
+        (Kannala and Brandt), kb4_decentred (with elements off the axis), equidistant,
+        equisolid, stereographic; or auto: the simplest that predicts pictures left out of the
+        solution as well as any.
     output
-        The .cameramodel to write, in mrcal's format; for its models, the first five, with all
-        that the solution was made of.
+        The .cameramodel to write, in mrcal's format, with the covariance of the intrinsics; for
+        mrcal's models, the first five, with all that the solution was made of.
     json
         Print the figures as JSON.
 
     """
+    from chromeball.calibrate.choose import choose_model
     from chromeball.calibrate.detect import Detection, detect_files
-    from chromeball.calibrate.lens import MODELS, calibrate_lens, choose_model
+    from chromeball.calibrate.lens import MODELS, calibrate_lens
     from chromeball.calibrate.plots import plot_coverage, plot_residuals, plot_uncertainty
     from chromeball.calibrate.target import parse_target
+    from chromeball.calibrate.views import repeated_views, spread_views
 
     board = parse_target(target)
     if model not in MODELS:
@@ -74,17 +76,31 @@ def lens(
             {"file": d.file, "corners": d.count, "blur": d.blur, "verdict": d.verdict}
             for d in detections
         ]
+        repeats = repeated_views(corners, size)
+        for view, first in enumerate(repeats):
+            if first >= 0:
+                say(f"{used[view].file}: left out, it repeats {used[first].file}")
+        kept = np.flatnonzero(repeats < 0)
+        spread = spread_views(corners[kept])
+        if not spread.all():
+            say(f"{len(kept)} views: the {spread.sum()} that differ most are used")
+        dropped = [used[i] for i in sorted({*range(len(used))} - {*kept[spread].tolist()})]
+        used = [used[i] for i in kept[spread]]
+        corners = corners[kept[spread]]
         chosen = model
         if model == "auto":
-            chosen, errors = choose_model(
+            choice = choose_model(
                 corners, board, size, lambda m, e: say(f"{m}: held-out error {e:.3f} px")
             )
-            stage.figures["held_out_rms"] = errors
+            chosen = choice.model
+            stage.figures |= {"held_out_rms": choice.errors, "reason": choice.reason}
+            say(f"{chosen}: {choice.reason}")
         result = calibrate_lens(corners, board, size, chosen, [str(d.file) for d in used])
         figures = result.figures() | {
             "views_used": len(used),
             "views_skipped": len(detections) - len(used),
             "skipped": [str(d.file) for d in detections if not d.usable],
+            "repeated": [str(d.file) for d in dropped],
             "chosen_model": chosen,
             "view_rms": dict(zip((str(d.file) for d in used), result.view_rms, strict=True)),
         }
