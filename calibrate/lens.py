@@ -58,15 +58,15 @@ def calibrate_lens(
             f"the board was found in {_count(len(corners), 'picture')}; a lens needs "
             f"{FEWEST_VIEWS}, better 15, with the board tilted in different directions"
         )
+    if model == "splined" and isinstance(target, AprilGrid):
+        raise UserError(
+            "mrcal, which solves splined, knows only boards of evenly spaced corners, not "
+            "an AprilGrid: take another model"
+        )
     name = f"LENSMODEL_{model.upper()}" if model in OPENCV else model
     check_count(corners, model, 4 if model == "splined" else parameters(name))
     start = fit_start(corners, target, size) if start is None else start
     if model == "splined":
-        if isinstance(target, AprilGrid):
-            raise UserError(
-                "mrcal, which solves splined, knows only boards of evenly spaced corners, not "
-                "an AprilGrid: take another model"
-            )
         start = fit_model(start, corners, target, "kb4")
         return solve_mrcal.solve_splined(start, corners, target, paths)
     fit = fit_model(start, corners, target, name)
