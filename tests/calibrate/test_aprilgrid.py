@@ -184,8 +184,8 @@ def test_solvers_of_even_boards_refuse_it() -> None:
 
 def test_opencv_models_take_it() -> None:
     """Its corners are not evenly spaced, which mrcal's boards are: our own solution stands."""
-    camera = CameraModel("LENSMODEL_OPENCV4", np.array([520.0, 523, 331, 228, -0.2, 0.05, 0, 0]),
-                         (640, 480))  # fmt: skip
+    k = np.array([520.0, 523, 331, 228, -0.2, 0.05, 0, 0])
+    camera = CameraModel("LENSMODEL_OPENCV4", k, (640, 480))
     corners = project(GRID, camera, board_poses(GRID, camera, 10, seed=1), noise=0.1)
     lens = calibrate_lens(corners, GRID, camera.size, "opencv4")
     miss = np.abs(lens.camera.intrinsics - camera.intrinsics)
