@@ -1,8 +1,9 @@
 """A camera from a single picture: points of known place, and lines along the world's axes.
 
 Focal length and pose are solved together, the principal point with them: it is believed to be
-the picture's middle within a share of its width, and what that leaves open is in the standard
-errors. No start is asked for: lenses of many fields of view are tried, each posed by points
+the picture's middle within a share of its width, and an unknown lens to bend straight lines a
+little. What that leaves open is in the standard errors; where the clicks can tell, they do. No
+start is asked for: lenses of many fields of view are tried, each posed by points
 (perspective-n-point) or by the vanishing points of the lines, and the best ones refined. What
 fits as well as the best, but lies elsewhere, is told.
 """
@@ -15,8 +16,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from chromeball.calibrate.pose import start_poses
+from chromeball.calibrate.match_start import candidates, starts
 from chromeball.calibrate.resection import (
+    BENT,
     POSE,
     UNKNOWNS,
     Evidence,
@@ -32,8 +34,6 @@ from chromeball.scene.pose import Pose
 
 type Array = NDArray[np.float64]
 
-#: Horizontal fields of view that are tried, degrees.
-FIELDS_OF_VIEW = np.geomspace(6, 140, 22)
 #: So many of them are refined, of each pose that a plane allows.
 TRIED = 5
 #: The principal point of an uncropped picture lies within this share of its width (1 sigma).
@@ -42,18 +42,23 @@ CENTRE = 0.01
 WORST_FOCAL = 0.2
 #: Excess of the squared rows below which two solutions cannot be told apart: 3 sigma.
 RIVAL = 9.0
-NAMES = ("focal", "cx", "cy", "pitch", "yaw", "roll", "x", "y", "z")
+#: A lens that nobody knows moves the picture's corners by this share of their distance from the
+#: middle (1 sigma): photographic lenses by up to 0.03, webcams by more.
+BEND = 0.03
+NAMES = ("focal", "cx", "cy", "pitch", "yaw", "roll", "x", "y", "z", "k1")
 
 
 @dataclass(frozen=True)
 class Match:
     """A camera matched to a picture.
 
-    ``camera`` with its pose. ``residuals`` (N, 2) of the points, projected minus clicked, and
-    ``line_residuals`` (M,) how far a line's ends lie off its axis, pixels. ``covariance``
-    (9, 9) of ln f, the principal point (pixels), the turn about the camera's x, y, z (radians)
-    and the position (world, metres); zero for what was known. ``rivals`` are cameras elsewhere
-    that fit as well within 3 standard deviations.
+    ``camera`` with its pose; of an unknown lens mrcal's OPENCV4 with k1 alone. ``residuals``
+    (N, 2) of the points, projected minus clicked, and ``line_residuals`` (M,) how far a line's
+    ends lie off its axis, pixels. ``covariance`` (10, 10) of ln f, the principal point
+    (pixels), the turn about the camera's x, y, z (radians), the position (world, metres) and
+    k1; zero for what was known. ``misfit`` is how many times as far the clicks are off as their sigma
+    explains, 1 where nothing can tell; above 1 the covariance is larger by its square.
+    ``rivals`` are cameras elsewhere that fit as well within 3 standard deviations.
     """
 
     camera: CameraModel
@@ -63,11 +68,12 @@ class Match:
     sigma: float
     covariance: Array
     condition: float
+    misfit: float
     rivals: tuple[CameraModel, ...]
 
     @property
     def standard_errors(self) -> Array:
-        """Of the nine unknowns, (9,)."""
+        """Of the ten unknowns, (10,)."""
         return np.sqrt(np.diag(self.covariance))
 
 
@@ -81,6 +87,7 @@ def match(
     sigma: float = 0.5,
     focal_known: bool = False,
     centre_sigma: float | None = None,
+    bend_sigma: float = BEND,
     above_floor: bool = False,
 ) -> Match:
     """The camera that sees world `points` (N, 3) at `pixels` (N, 2), and lines along `axes`.
@@ -103,6 +110,9 @@ def match(
     centre_sigma
         How far the principal point may be from `lens`'s, pixels; by default a hundredth of the
         width. For a picture that was cropped: large.
+    bend_sigma
+        How far a lens without distortion (``pinhole``) may move the picture's corners after
+        all, as a share of their distance from the middle; 0 where it is known not to.
     above_floor
         Only cameras with y > 0.
 
@@ -114,6 +124,9 @@ def match(
 
     """
     width = lens.size[0]
+    bends = lens.model == "pinhole" and not focal_known and bend_sigma > 0
+    if bends:
+        lens = replace(lens, model=BENT, intrinsics=np.append(lens.intrinsics, np.zeros(4)))
     evidence = _evidence(lens, points, pixels, axes, ends, sigma)
     n = focals(lens)
     evidence = replace(
@@ -121,9 +134,10 @@ def match(
         centre=lens.intrinsics[n : n + 2].copy(),
         centre_sigma=CENTRE * width if centre_sigma is None else centre_sigma,
     )
-    free = POSE.copy() if focal_known else np.ones(UNKNOWNS, bool)
+    free = POSE.copy() if focal_known else np.arange(UNKNOWNS) < 9
+    free[9] = bends
     _check_count(evidence, focal_known)
-    fits = _solve(lens, evidence, free, focal_known)
+    fits = _solve(lens, evidence, free, focal_known, bend_sigma)
     standing = [fit for fit in fits if not above_floor or fit.pose.inverse().translation[1] > 0]
     if not standing:
         raise UserError(
@@ -145,10 +159,13 @@ def match(
             "axis a line runs along, and whether the lens distorts (--camera)"
         )
     covariance, condition = _covariance(best, free, evidence)
+    spare = len(best.rows) - int(free.sum())
+    misfit = math.sqrt(best.cost / spare) if spare > 0 else 1.0
+    covariance = covariance * max(misfit, 1.0) ** 2
     rivals = [
         fit.camera.posed(fit.pose.inverse())
         for fit in standing[1:]
-        if fit.cost - best.cost < RIVAL and not _same(fit, best)
+        if fit.cost - best.cost < RIVAL * max(misfit, 1.0) ** 2 and not _same(fit, best)
     ]
     return Match(
         camera=best.camera.posed(best.pose.inverse()),
@@ -158,6 +175,7 @@ def match(
         sigma=sigma,
         covariance=covariance,
         condition=condition,
+        misfit=misfit,
         rivals=tuple(rivals),
     )
 
@@ -219,15 +237,19 @@ def _check_count(evidence: Evidence, focal_known: bool) -> None:
 
 
 def _solve(
-    lens: CameraModel, evidence: Evidence, free: NDArray[np.bool_], focal_known: bool
+    lens: CameraModel,
+    evidence: Evidence,
+    free: NDArray[np.bool_],
+    focal_known: bool,
+    bend_sigma: float,
 ) -> list[Fit]:
     """Distinct local minima, the best first."""
-    # The principal point stays where it is believed until the rest is in place.
-    held = free & ~np.isin(np.arange(UNKNOWNS), (1, 2))
+    # Principal point and k1 stay as they are believed until the rest is in place.
+    held = free & ~np.isin(np.arange(UNKNOWNS), (1, 2, 9))
     # Of a plane two poses fit: each branch has its own best focal lengths.
     branches: tuple[list[Fit], ...] = ([], [])
-    for camera in [lens] if focal_known else _candidates(lens):
-        for branch, pose in zip(branches, _starts(camera, evidence), strict=False):
+    for camera in [lens] if focal_known else candidates(lens):
+        for branch, pose in zip(branches, starts(camera, evidence), strict=False):
             first = linearise(camera, pose, evidence, held)
             if np.isfinite(first.rows).all():
                 branch.append(first)
@@ -240,80 +262,14 @@ def _solve(
     rough.sort(key=lambda fit: fit.cost)
     found: list[Fit] = []
     for start in rough:
+        corner = math.hypot(*lens.size) / 2 / start.camera.intrinsics[0]
+        evidence = replace(evidence, k1_sigma=bend_sigma / corner**2) if free[9] else evidence
         fit = refine(start.camera, start.pose, evidence, free, steps=60)
         if fit is None or not _sound(fit, evidence) or any(_same(fit, f) for f in found):
             continue
         found.append(fit)
     found.sort(key=lambda fit: fit.cost)
     return found
-
-
-def _candidates(lens: CameraModel) -> list[CameraModel]:
-    """The lens with other focal lengths."""
-    cameras: list[CameraModel] = []
-    n = focals(lens)
-    for degrees in FIELDS_OF_VIEW:
-        values = lens.intrinsics.copy()
-        values[:n] *= lens.size[0] / (2 * math.tan(math.radians(degrees) / 2) * values[0])
-        cameras.append(replace(lens, intrinsics=values))
-    return cameras
-
-
-def _starts(camera: CameraModel, evidence: Evidence) -> list[Pose]:
-    """Poses camera_from_world by the points, or else by the lines."""
-    if len(evidence.points) >= 4:
-        rays = camera.unproject(evidence.pixels)
-        if np.isfinite(rays).all() and (poses := start_poses(evidence.points, rays)):
-            return poses
-    if not len(evidence.axes):
-        return []
-    turn = _turn_of_lines(camera, evidence)
-    if turn is None:
-        return []
-    # r x (R p + t) = 0 for every point
-    rays = camera.unproject(evidence.pixels)
-    if not np.isfinite(rays).all():
-        return []
-    cross = np.cross(np.eye(3), rays[:, None, :])  # rows of [r]
-    turned = evidence.points @ turn.T
-    right = -np.einsum("nij,nj->ni", cross, turned)
-    shift = np.linalg.lstsq(cross.reshape(-1, 3), right.ravel(), rcond=None)[0]
-    return [Pose(turn, shift)]
-
-
-def _turn_of_lines(camera: CameraModel, evidence: Evidence) -> Array | None:
-    """The rotation of camera_from_world by the vanishing points of two axes or three."""
-    rays = camera.unproject(evidence.ends)
-    if not np.isfinite(rays).all():
-        return None
-    normals = np.cross(rays[:, 0], rays[:, 1])
-    columns = np.full((3, 3), np.nan)
-    for axis in range(3):
-        own = normals[evidence.axes == axis]
-        if len(own) >= 2:
-            columns[:, axis] = np.linalg.svd(own)[2][2]
-    known = np.isfinite(columns[0])
-    if known.sum() < 2:
-        return None
-    turn = np.where(known, columns, 0.0)
-    # Signs: in the picture, too, the second end lies farther along the axis.
-    middle = camera.unproject(evidence.ends.mean(axis=1))
-    _, by_point = camera.project_with_jacobian(middle)
-    w = np.einsum("mij,mj->mi", by_point, turn.T[evidence.axes])
-    forth = (w * (evidence.ends[:, 1] - evidence.ends[:, 0])).sum(axis=1)
-    for axis in np.flatnonzero(known).tolist():
-        if forth[evidence.axes == axis].sum() < 0:
-            turn[:, axis] *= -1
-    if not known.all():
-        missing = int(np.flatnonzero(~known)[0])
-        turn[:, missing] = np.cross(turn[:, (missing + 1) % 3], turn[:, (missing + 2) % 3])
-    u, _, vt = np.linalg.svd(turn)
-    if np.linalg.det(u @ vt) < 0:
-        raise UserError(
-            "the lines' axes are left-handed: of each line the second end lies farther along "
-            "its axis, and x, y, z are right-handed with y up"
-        )
-    return np.asarray(u @ vt, float)
 
 
 def _sound(fit: Fit, evidence: Evidence) -> bool:
@@ -330,7 +286,7 @@ def _sound(fit: Fit, evidence: Evidence) -> bool:
 
 
 def _covariance(fit: Fit, free: NDArray[np.bool_], evidence: Evidence) -> tuple[Array, float]:
-    """Covariance (9, 9) in the terms of :class:`Match`, and the scaled condition."""
+    """Covariance (10, 10) in the terms of :class:`Match`, and the scaled condition."""
     normal = fit.jacobian.T @ fit.jacobian
     size = np.sqrt(np.diag(normal))
     condition = (
@@ -346,7 +302,7 @@ def _covariance(fit: Fit, free: NDArray[np.bool_], evidence: Evidence) -> tuple[
         raise UserError("the points do not determine the pose: they are too close together")
     change = np.eye(UNKNOWNS)
     change[3:6, 3:6] *= -1
-    change[6:, 6:] = -fit.pose.rotation.T
+    change[6:9, 6:9] = -fit.pose.rotation.T
     full = np.zeros((UNKNOWNS, UNKNOWNS))
     full[np.ix_(free, free)] = spread
     return change @ full @ change.T, condition

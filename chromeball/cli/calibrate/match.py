@@ -17,6 +17,9 @@ from chromeball.cli.calibrate.clicks import (
 from chromeball.scene.errors import UserError
 from chromeball.scene.record import Stage
 
+#: Clicks this many times farther off than they are said to be are worth a word.
+MISFIT = 2.0
+
 
 def match(
     picture: Path,
@@ -32,6 +35,7 @@ def match(
     focal: Literal["auto", "known", "free"] = "auto",
     sigma: float = 0.5,
     centre_sigma: float | None = None,
+    bend_sigma: float | None = None,
     json: Json = False,
 ) -> None:
     """Find focal length and pose of the camera that took a picture, from what it shows.
@@ -53,7 +57,7 @@ def match(
     corners
         The pixels of its corners, far left, far right, near right, near left: "x,y x,y ...".
     camera
-        A lens whose distortion and principal point hold; else one without distortion.
+        A lens whose distortion and principal point hold; else one that bends by --bend-sigma.
     focal
         known keeps the focal length of --camera, free finds another (a zoom); auto is known
         with --camera, else free.
@@ -62,13 +66,16 @@ def match(
     centre_sigma
         How far the principal point may be from the middle (or --camera's), pixels; a hundredth
         of the width, more for cropped pictures.
+    bend_sigma
+        How far an unknown lens may move the picture's corners, as a share of their distance
+        from the middle; 0.03, more for webcams and action cameras, 0 for no distortion at all.
     output
         The posed .cameramodel to write.
     json
         Print the figures as JSON.
 
     """
-    from chromeball.calibrate.match import NAMES
+    from chromeball.calibrate.match import BEND, NAMES
     from chromeball.calibrate.match import match as solve
     from chromeball.scene.camera import CameraModel
     from chromeball.scene.image import read_header
@@ -79,6 +86,10 @@ def match(
         raise UserError(f"--sigma {sigma:g}: a click's error in pixels is positive")
     if centre_sigma is not None and not 0 < centre_sigma < 1e6:
         raise UserError(f"--centre-sigma {centre_sigma:g}: pixels, positive")
+    if bend_sigma is not None and camera is not None:
+        raise UserError("--bend-sigma says nothing of a known lens: leave it out")
+    if bend_sigma is not None and not 0 <= bend_sigma < 1:
+        raise UserError(f"--bend-sigma {bend_sigma:g}: a share of the distance, such as 0.03")
     known = focal == "known" or (focal == "auto" and camera is not None)
     if known and centre_sigma is not None:
         raise UserError("--centre-sigma says nothing of a known lens: leave it out")
@@ -111,7 +122,7 @@ def match(
     inputs = [p for p in (picture, points, lines, align, camera) if p is not None]
     options = {
         "rectangle": rectangle, "corners": corners, "focal": focal, "sigma": sigma,
-        "centre_sigma": centre_sigma,
+        "centre_sigma": centre_sigma, "bend_sigma": bend_sigma,
     }  # fmt: skip
     with Stage("calibrate match", inputs, **options) as stage:
         found = solve(
@@ -123,6 +134,7 @@ def match(
             sigma=sigma,
             focal_known=known,
             centre_sigma=centre_sigma,
+            bend_sigma=BEND if bend_sigma is None else bend_sigma,
             above_floor=floor,
         )
         errors = found.standard_errors
@@ -135,7 +147,8 @@ def match(
                 "sigma_focal_percent": 100 * errors[0],
                 "sigma_centre_px": errors[1:3],
                 "position": place,
-                "sigma_position": errors[6:],
+                "sigma_position": errors[6:9],
+                "misfit": found.misfit,
                 "sigma_rotation_degrees": [math.degrees(v) for v in errors[3:6]],
                 "residuals": found.residuals,
                 "line_residuals": found.line_residuals,
@@ -153,6 +166,11 @@ def match(
         )
         with stage.output(output) as temporary:
             found.camera.write(temporary)
+    if found.misfit > MISFIT:
+        say(
+            f"the clicks are {found.misfit:.1f} times as far off as --sigma says, which is in "
+            "the standard errors: look for a wrong point, or calibrate the lens"
+        )
     for rival in found.rivals:
         x, y, z = rival.world_from_camera.translation
         say(
@@ -167,6 +185,6 @@ def match(
         f"{output}: focal length {value:.0f} px +- {errors[0]:.1%}, camera at {x:.3f}, "
         f"{y:.3f}, {z:.3f} m, RMS {found.rms:.2f} px"
     )
-    shifts = ", ".join(f"{v * 1000:.1f}" for v in errors[6:])
+    shifts = ", ".join(f"{v * 1000:.1f}" for v in errors[6:9])
     turns = ", ".join(f"{math.degrees(v):.3f}" for v in errors[3:6])
     print(f"standard errors {shifts} mm; pitch, yaw, roll {turns} degrees")
