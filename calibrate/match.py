@@ -56,8 +56,9 @@ class Match:
     (N, 2) of the points, projected minus clicked, and ``line_residuals`` (M,) how far a line's
     ends lie off its axis, pixels. ``covariance`` (10, 10) of ln f, the principal point
     (pixels), the turn about the camera's x, y, z (radians), the position (world, metres) and
-    k1; zero for what was known. ``misfit`` is how many times as far the clicks are off as their sigma
-    explains, 1 where nothing can tell; above 1 the covariance is larger by its square.
+    k1; zero for what was known. ``misfit`` is how many times as far the clicks are off as
+    their sigma explains, 1 where nothing can tell; above 1 the covariance is larger by its
+    square.
     ``rivals`` are cameras elsewhere that fit as well within 3 standard deviations.
     """
 
