@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -95,3 +96,48 @@ def watch(
         pixels = np.where(swapped[..., None, None], pixels[:, :, ::-1], pixels)
     names = tuple(f"cam{i}" for i in range(len(cameras)))
     return Tracks(names, tuple(c.size for c in cameras), pixels, np.ones(pixels.shape[:3]))
+
+
+def film(
+    camera: CameraModel,
+    points: NDArray[np.float64],
+    *,
+    frames: int,
+    steps: int = 4,
+    peak: float = 500.0,
+    mirror: float = 0.3,
+    table: float = 0.7,
+    noise: float = 2.0,
+    seed: int = 0,
+) -> Iterator[NDArray[np.uint8]]:
+    """Pictures (H, W, 3) of lights (F * steps, K, 3) that move during an exposure.
+
+    An exposure lasts half of a frame's `steps`, its middle at step ``f * steps``. Lights of
+    `peak` codes are saturated above 255, their reflection in a `table` so high, metres, is
+    `mirror` times as bright; a lamp stands still.
+    """
+    rng = np.random.default_rng(seed)
+    width, height = camera.size
+    y, x = np.mgrid[:height, :width].astype(np.float32)
+    still = 30 + 20 * np.sin(x / 37) * np.cos(y / 23)
+    still += 180 * np.exp(-((x - 0.8 * width) ** 2 + (y - 0.2 * height) ** 2) / 18)
+    span = steps // 4
+    for f in range(frames):
+        picture = still.copy()
+        exposed = range(f * steps - span, f * steps + span + 1)
+        inside = [s for s in exposed if 0 <= s < len(points)]
+        for s in inside:
+            reflected = points[s] * [1, -1, 1] + [0, 2 * table, 0]
+            for there, share in ((points[s], 1.0), (reflected, mirror)):
+                for u, v in camera.project_world(there):
+                    if not (np.isfinite(u) and -20 < u < width + 20 and -20 < v < height + 20):
+                        continue
+                    x0, y0 = max(0, int(u) - 12), max(0, int(v) - 12)
+                    window = np.s_[y0 : int(v) + 13, x0 : int(u) + 13]
+                    square = (x[window] - u) ** 2 + (y[window] - v) ** 2
+                    picture[window] += (
+                        share * peak / len(inside) * np.exp(-square / (2 * 1.6**2))
+                    )
+        picture += noise * rng.standard_normal(picture.shape)
+        grey = np.clip(np.rint(picture), 0, 255).astype(np.uint8)
+        yield np.repeat(grey[..., None], 3, axis=2)

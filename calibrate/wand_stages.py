@@ -18,6 +18,8 @@ from chromeball.scene.errors import UserError
 OUTLIER = 4.0
 #: The wand's lengths are kept to this share.
 LENGTH_TOLERANCE = 1e-4
+#: Lights found anew whose distance is so far off are not those of the wand.
+LENGTH_MISS = 0.1
 #: A light that changes its speed by more than its speed and so many pixels a frame jumped.
 JUMP = 5.0
 UNEXPLAINED = (
@@ -81,7 +83,7 @@ class Stages:
         """Least squares on the lights that fit, until these stay the same; and which."""
         used = np.zeros(self.sightings.weights.shape, bool)
         sigma = spread(self.distance(bundle)[self.plausible(bundle)])
-        for _ in range(10):
+        for turn in range(10):
             fits = alive(self.plausible(bundle) & (self.distance(bundle) < OUTLIER * sigma))
             if (fits == used).all():
                 break
@@ -92,7 +94,8 @@ class Stages:
                 bundle, self.sightings, used, self.freedom(sigma, 3, delays), steps=20
             )
             sigma = self.sigma(bundle, used)
-            bundle = self.found_anew(bundle, OUTLIER * sigma, lost=~used.any(axis=(0, 2)))
+            if turn == 0:  # once: else what is rejected would come back for ever
+                bundle = self.found_anew(bundle, OUTLIER * sigma, lost=~used.any(axis=(0, 2)))
         return bundle, used
 
     def distance(self, bundle: Bundle) -> NDArray[np.float64]:
@@ -120,8 +123,12 @@ class Stages:
         start = Start(
             bundle.rotations, bundle.translations, bundle.points, some, ~some[:, None]
         )
+        found = triangulate(rays, start, miss * angle)
+        for first, second, length in self.lengths:
+            apart = np.linalg.norm(found[:, first] - found[:, second], axis=-1)
+            found[np.abs(apart / length - 1) > LENGTH_MISS] = np.nan
         points = bundle.points.copy()
-        points[frames] = triangulate(rays, start, miss * angle)
+        points[frames] = found
         return replace(bundle, points=points)
 
     def sigma(self, bundle: Bundle, used: NDArray[np.bool_]) -> float:
@@ -142,7 +149,7 @@ def at_delays(
     """What a camera with each of `delays` (C,), frames, saw at the common instants.
 
     `pixels` (C, F, K, 2) are its own frames; a parabola through three of them gives what was
-    between. NaN where one of the three is missing.
+    between. The speed is NaN where nothing is known beside a frame.
     """
     shifted, speeds = np.full(pixels.shape, np.nan), np.full(pixels.shape, np.nan)
     frames = pixels.shape[1]
@@ -156,6 +163,9 @@ def at_delays(
         before, here, after = padded[:-2], padded[1:-1], padded[2:]
         # A wand's other end may come first in the next frame.
         before, after = (_like(here, other) for other in (before, after))
+        # Where one of the three is missing, a line through the others.
+        before = np.where(np.isfinite(before), before, 2 * here - after)
+        after = np.where(np.isfinite(after), after, 2 * here - before)
         speed, bend = (after - before) / 2, after - 2 * here + before
         rough = np.linalg.norm(bend, axis=-1) > np.linalg.norm(speed, axis=-1) + JUMP
         speed[rough] = np.nan

@@ -44,20 +44,28 @@ def on_floor(rig: WandRig, frames: tuple[int, int, int]) -> WandRig:
 
 
 def as_surveyed(rig: WandRig, centres: NDArray[np.float64]) -> tuple[WandRig, float]:
-    """The rig nearest to known camera centres (C, 3), metres; and the RMS of what is left.
-
-    The similarity of least squares (Umeyama 1991).
-    """
+    """The rig nearest to known camera centres (C, 3), metres; and the RMS of what is left."""
     if len(centres) < 3:
         raise UserError("three centres or more place a rig in a room; give --distance for two")
-    here, there = rig.centres.mean(axis=0), centres.mean(axis=0)
-    a, b = rig.centres - here, centres - there
+    rotation, shift, factor = similarity(rig.centres, centres)
+    moved = rig.moved(Pose(rotation, shift), factor, "m")
+    left = moved.centres - centres
+    return moved, float(np.sqrt((left**2).sum(axis=1).mean()))
+
+
+def similarity(
+    points: NDArray[np.float64], targets: NDArray[np.float64], *, scaled: bool = True
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """Rotation, shift and factor that take `points` (N, 3) nearest to `targets`.
+
+    The least squares of Umeyama 1991; the factor is one unless `scaled`.
+    """
+    here, there = points.mean(axis=0), targets.mean(axis=0)
+    a, b = points - here, targets - there
     u, s, vt = np.linalg.svd(b.T @ a)
     if s[1] < 1e-6 * s[0]:
         raise UserError("the cameras stand in a line, which leaves a turn about it open")
     sign = np.array([1, 1, np.sign(np.linalg.det(u @ vt))])
     rotation = (u * sign) @ vt
-    factor = float((s * sign).sum() / (a**2).sum())
-    moved = rig.moved(Pose(rotation, there - factor * rotation @ here), factor, "m")
-    left = moved.centres - centres
-    return moved, float(np.sqrt((left**2).sum(axis=1).mean()))
+    factor = float((s * sign).sum() / (a**2).sum()) if scaled else 1.0
+    return rotation, there - factor * rotation @ here, factor

@@ -19,9 +19,13 @@ type Several = Annotated[list[Path] | None, Parameter(negative="", consume_multi
 
 
 def wand(
+    sources: Annotated[list[Path] | None, Parameter(negative="")] = None,
+    /,
     *,
-    points: Path,
     output: Out,
+    points: Path | None = None,
+    wand: str | None = None,
+    lights: int | None = None,
     lens: Several = None,
     model: Literal["pinhole", "opencv4", "kb4"] = "opencv4",
     refine: Annotated[bool, Parameter(negative="")] = False,
@@ -34,14 +38,23 @@ def wand(
 ) -> None:
     """Place the cameras of a room, and calibrate their lenses, by a light that they saw move.
 
-    Scale comes from a distance or from known centres; without both the unit is the distance of
-    the first two cameras. The axes are those of the first camera unless --up, --floor or
-    --centres tells others.
+    Scale comes from the wand's length, a distance or known centres; without these the unit is
+    the distance of the first two cameras. The axes are those of the first camera unless --up,
+    --floor or --centres tells others.
 
     Parameters
     ----------
+    sources
+        For each camera a video, or a folder of pictures in the order of their names; the
+        camera is called as its file or folder is.
     points
-        A folder of MultiCamSelfCal's: points.dat, IdMat.dat, Res.dat, camera_order.txt.
+        Instead of these a folder of MultiCamSelfCal's: points.dat, IdMat.dat, Res.dat,
+        camera_order.txt.
+    wand
+        Distance of the two lights of a wand in metres, 0.5, or of three in a line from one to
+        the next, "0.2,0.3". All lights must be seen for a frame to count.
+    lights
+        Number of lights, if the wand's length is unknown; 1 by default.
     output
         The folder to write: NAME.cameramodel for each camera and rig.json.
     lens
@@ -73,21 +86,38 @@ def wand(
 
     if sum(choice is not None for choice in (up, floor, centres)) > 1:
         raise UserError("--up, --floor and --centres each give the axes: choose one")
-    if distance is not None and centres is not None:
-        raise UserError("--distance and --centres each give the scale: choose one")
+    if sum(choice is not None for choice in (wand, distance, centres)) > 1:
+        raise UserError("--wand, --distance and --centres each give the scale: choose one")
+    if (points is None) == (not sources):
+        raise UserError("name a video or folder for each camera, or --points DIR")
+    lengths = _lengths(wand)
+    count = _lights(lights, wand, points)
     if refine and not lens:
         raise UserError("--refine refines lenses that are given: name them with --lens")
     check_output(output / "rig.json")
-    files = [points / name for name in ("points.dat", "IdMat.dat", "Res.dat")]
-    options = {"model": model, "refine": refine, "distance": distance, "up": up, "floor": floor}
+    options = {
+        "model": model,
+        "refine": refine,
+        "wand": wand,
+        "lights": count,
+        "distance": distance,
+        "up": up,
+        "floor": floor,
+        "synchronous": synchronous,
+    }
     extra = [*(lens or ()), *([centres] if centres else ())]
-    with Stage("calibrate wand", [*files, *extra], **options) as stage:
-        tracks = read_points(points)
+    with Stage("calibrate wand", [*_files(sources, points), *extra], **options) as stage:
+        rate = None
+        if points is not None:
+            tracks = read_points(points)
+        else:
+            tracks, rate, stage.figures["tracks"] = _followed(sources or [], count)
         rig = solve_wand(
             tracks,
             _lenses(lens, tracks),
             model=model,
             refine=refine,
+            lengths=lengths,
             distance=_distance(distance, tracks),
             synchronous=synchronous,
         )
@@ -117,8 +147,73 @@ def wand(
         line = f"  {name}: at {x:.4f}, {y:.4f}, {z:.4f} +- {errors} {unit}"
         if rig.delays.any():
             line += f"; {rig.delays[c]:+.3f} +- {rig.delay_errors[c]:.2g} frames late"
+            line += f" ({1000 * rig.delays[c] / rate:+.1f} ms)" if rate else ""
         print(line)
     print(f"{rig.gauge()}; lengths in {'metres' if metres else f'the {rig.unit}'}")
+
+
+def _lengths(text: str | None) -> tuple[tuple[int, int, float], ...]:
+    """Distances of all pairs of lights from those of one to the next."""
+    if text is None:
+        return ()
+    try:
+        steps = [float(word) for word in text.split(",")]
+    except ValueError:
+        steps = []
+    if not 1 <= len(steps) <= 2 or not all(0 < step < 1e3 for step in steps):
+        raise UserError(
+            f"--wand {text!r}: write the distance of two lights in metres, 0.5, or of three "
+            'from one to the next, "0.2,0.3"'
+        )
+    pairs = [(i, i + 1, step) for i, step in enumerate(steps)]
+    return (*pairs, (0, 2, sum(steps))) if len(steps) == 2 else tuple(pairs)
+
+
+def _lights(lights: int | None, wand: str | None, points: Path | None) -> int:
+    count = 1 if wand is None else wand.count(",") + 2
+    if points is not None and (wand is not None or lights is not None):
+        raise UserError("--points hold one light: --wand and --lights are for recordings")
+    if lights is None:
+        return count
+    if not 1 <= lights <= 3 or (wand is not None and lights != count):
+        raise UserError("--lights: a wand has one to three lights, as many as --wand says")
+    return lights
+
+
+def _files(sources: list[Path] | None, points: Path | None) -> list[Path]:
+    """What the rig is made of."""
+    from chromeball.calibrate.led_frames import open_recording
+
+    if points is not None:
+        return [points / name for name in ("points.dat", "IdMat.dat", "Res.dat")]
+    return [file for source in sources or [] for file in open_recording(source).files]
+
+
+def _followed(
+    sources: list[Path], lights: int
+) -> tuple[Tracks, float | None, dict[str, object]]:
+    """The tracks of all recordings, their frames a second, and figures of each."""
+    from concurrent.futures import ThreadPoolExecutor
+
+    from chromeball.calibrate.led import LightTrack, together, track_lights
+
+    def one(source: Path) -> LightTrack:
+        track = track_lights(source, lights)
+        say(f"{source}: {track.verdict()}")
+        return track
+
+    with ThreadPoolExecutor() as pool:
+        found = list(pool.map(one, sources))
+    figures: dict[str, object] = {
+        t.name: {
+            "frames": len(t.pixels),
+            "frames_without": t.none,
+            "frames_ambiguous": t.several,
+            "frames_flooded": t.flooded,
+        }
+        for t in found
+    }
+    return together(found), found[0].rate, figures
 
 
 def _lenses(paths: list[Path] | None, tracks: Tracks) -> tuple[CameraModel, ...] | None:
@@ -169,8 +264,8 @@ def _advice(rig: WandRig) -> list[str]:
     lines: list[str] = []
     if rig.unit != "m":
         lines.append(
-            "nothing tells the scale: give --distance or --centres, or record a wand of two "
-            "lights of known length"
+            "nothing tells the scale: give --distance or --centres, or record two lights on a "
+            "wand and give its length with --wand"
         )
     if rig.delays.any():
         lines.append(
