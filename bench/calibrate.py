@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bench import calibrate_fisheye, calibrate_targets, calibrate_tracker
+from bench import calibrate_fisheye, calibrate_targets, calibrate_tracker, calibrate_wand
 from bench.row import Row
 from chromeball.calibrate.choose import pose_errors
 from chromeball.calibrate.detect import detect
@@ -33,6 +33,7 @@ def rows(quick: bool) -> list[Row]:
         *calibrate_fisheye.rows(quick),
         *calibrate_targets.rows(quick),
         *calibrate_tracker.rows(quick),
+        *calibrate_wand.rows(quick),
     ]
 
 

@@ -123,7 +123,7 @@ def _pycolmap(
 
 
 def _mapped(tracks: Tracks, cameras: tuple[CameraModel, ...] | None) -> Any:
-    """Its largest reconstruction of the tracks as keypoints of one picture a camera, or None."""
+    """Its largest reconstruction, the tracks as keypoints of one picture a camera, or None."""
     import pycolmap
 
     pycolmap.logging.minloglevel = 3
@@ -180,7 +180,7 @@ def _mapped(tracks: Tracks, cameras: tuple[CameraModel, ...] | None) -> Any:
 def _real() -> list[Row]:
     """RMS per light of what each tool keeps, and how much that is."""
     folder = DATA / "caldata20130726_122220"
-    sets = {"3 cameras x 890": "DATA20090709_111010", "4 x 1125": "DATA20100906_134124"}
+    others = {"3 cameras x 890": "DATA20090709_111010", "4 x 1125": "DATA20100906_134124"}
     tracks = read_points(folder)
     lenses = tuple(
         read_lens(folder / f"basename{i + 1}.rad", size) for i, size in enumerate(tracks.sizes)
@@ -189,8 +189,8 @@ def _real() -> list[Row]:
         ("4 x 464, lenses given", tracks, lenses),
         ("4 x 464, lenses blind", tracks, None),
         *(
-            (f"{name}, lenses blind", read_points(DATA / sub), None)
-            for name, sub in sets.items()
+            (f"{what}, lenses blind", read_points(DATA / name), None)
+            for what, name in others.items()
         ),
     ]
     found: list[Row] = []

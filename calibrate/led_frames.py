@@ -108,4 +108,4 @@ def _grey_file(file: Path) -> NDArray[np.float32]:
     colours = image.pixels[..., :3].astype(np.float32) * np.float32(FULL / white)
     if colours.shape[-1] < 3:
         return np.ascontiguousarray(colours[..., 0])
-    return np.asarray(colours @ np.array([0.299, 0.587, 0.114], np.float32))
+    return np.asarray(colours @ np.array([0.299, 0.587, 0.114], np.float32), np.float32)
