@@ -17,6 +17,7 @@ from chromeball.scene.record import read_json
 
 DATA = Path(__file__).resolve().parents[3] / "shared/data"
 SCEAUX = DATA / "stand_in/sceaux/images/100_7100.JPG"
+PANORAMA = DATA / "envmap/pano25/P1060369.JPG"
 BODY: dict[str, Any] = {"Model": "Canon EOS 5D Mark II", "Exif:FocalLength": 50.0}
 
 
@@ -109,7 +110,16 @@ def test_a_real_picture(sensor: str | None) -> None:
     """Sceaux castle, calibrated by others: 2905.88 px."""
     found = camera_from_exif(SCEAUX, sensor)
     off = math.log(found.camera.intrinsics[0] / 2905.88)
-    assert abs(off) < 2 * found.focal_error < 0.08
+    assert abs(off) < 2 * found.focal_error < 0.09
+
+
+@pytest.mark.skipif(not PANORAMA.is_file(), reason="the photographs are not here")
+@pytest.mark.parametrize("sensor", [None, "1/2.3in"])
+def test_a_picture_of_a_panorama(sensor: str | None) -> None:
+    """`envmap stitch` on the first eight of pano25: 972 px (its frames moved a little)."""
+    found = camera_from_exif(PANORAMA, sensor)
+    for clue in found.clues:
+        assert abs(math.log(clue.focal / 972)) < 2 * clue.error < 0.12
 
 
 @pytest.mark.skipif(not SCEAUX.is_file(), reason="the photographs are not here")
@@ -117,7 +127,7 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     output = tmp_path / "sceaux.cameramodel"
     words = ["calibrate", "exif", SCEAUX, "--sensor", "1/2.5in", "-o", output]
     build_app()([str(w) for w in words], result_action="return_value")
-    assert "5.85 mm on a sensor of 5.76 mm" in capsys.readouterr().out
+    assert "by 35 mm at 36 x 24 mm" in capsys.readouterr().out
     assert CameraModel.read(output).size == (2832, 2128)
     figures = read_json(f"{output}.record.json")["figures"]
     assert len(figures["clues"]) == 2
