@@ -39,8 +39,6 @@ def converted(
         When fewer than twelve of the rays are left.
 
     """
-    from scipy.optimize import least_squares
-
     if is_flat(model):
         rays = rays[rays[:, 2] > _GRAZING]
     pixels = camera.project(rays)
@@ -50,7 +48,17 @@ def converted(
         raise UserError(f"a lens in {model} needs directions up to 85 degrees from the axis")
     few = np.linspace(0, len(rays) - 1, min(len(rays), _ENOUGH)).astype(int)
     rays, pixels = rays[few], pixels[few]
-    start = _start(camera, model)
+    return fitted(_start(camera, model), rays, pixels)
+
+
+def fitted(
+    start: CameraModel, rays: NDArray[np.float64], pixels: NDArray[np.float64]
+) -> tuple[CameraModel, float]:
+    """The camera of `start`'s model that sees `rays` (N, 3) nearest to `pixels` (N, 2).
+
+    With it comes the RMS distance in pixels.
+    """
+    from scipy.optimize import least_squares
 
     def miss(values: NDArray[np.float64]) -> NDArray[np.float64]:
         q, _, _ = gradients(replace(start, intrinsics=values), rays)

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from chromeball.calibrate.formats import read_camera
 from chromeball.calibrate.wand_result import Tracks, WandRig
 from chromeball.scene.camera import CameraModel
 from chromeball.scene.errors import UserError
@@ -65,10 +66,10 @@ def read_points(folder: str | os.PathLike[str]) -> Tracks:
 
 
 def read_lens(path: str | os.PathLike[str], size: tuple[int, int]) -> CameraModel:
-    """A ``.cameramodel``, or a ``.rad`` of a camera of `size`: Bouguet's four distortions."""
+    """A camera file, or a ``.rad`` of a camera of `size`: Bouguet's four distortions."""
     path = Path(path)
     if path.suffix != ".rad":
-        return CameraModel.read(path)
+        return read_camera(path)
     pairs = re.findall(r"^\s*(\w+)\s*=\s*(\S+)\s*$", _text(path), re.MULTILINE)
     values: dict[str, float] = {}
     for name, text in pairs:

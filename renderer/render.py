@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from chromeball.calibrate.formats import read_camera
 from chromeball.renderer.composite import (
     CapturedSet,
     Composite,
@@ -229,7 +230,7 @@ def backdrop(scene: Scene, folder: Path, view: View, origin: NDArray[np.float64]
         return Backdrop(virtual_camera(view, origin), closing=closing)
     plate_file, camera_file = (folder / name for name in scene.photograph_of(view))
     plate = read_rgb(plate_file)
-    camera = CameraModel.read(camera_file)
+    camera = read_camera(camera_file)
     if camera.size != (plate.shape[1], plate.shape[0]):
         raise UserError(
             f"the camera is for {camera.size[0]} x {camera.size[1]} pixels, the plate has "
@@ -239,7 +240,7 @@ def backdrop(scene: Scene, folder: Path, view: View, origin: NDArray[np.float64]
     if view.closing_camera is None:
         return Backdrop(camera, plate, (plate_file, camera_file))
     closing_file = folder / view.closing_camera
-    closing = CameraModel.read(closing_file).world_from_camera
+    closing = read_camera(closing_file).world_from_camera
     return Backdrop(camera, plate, (plate_file, camera_file, closing_file), closing)
 
 

@@ -30,6 +30,7 @@ COMMANDS = {
     "render": ("chromeball.cli.render:render", "Synthetic objects into a photograph."),
     "view": ("chromeball.cli.view:view", "A scene in the browser, to move and to change."),
     "report": ("chromeball.cli.report:report", "One HTML file on what was done, and how well."),
+    "export": ("chromeball.cli.export:export", "Cameras as other programs read them."),
     "bench": ("chromeball.cli.bench:bench", "Run time against error, beside the peers."),
 }
 SUMMARY = "Capture light, calibrate cameras and insert synthetic objects into real places."

@@ -2,6 +2,7 @@
 
 from cyclopts import App
 
+from chromeball.cli.calibrate.convert import convert
 from chromeball.cli.calibrate.exif import exif
 from chromeball.cli.calibrate.lens import lens
 from chromeball.cli.calibrate.match import match
@@ -13,5 +14,5 @@ from chromeball.cli.calibrate.undistort import undistort
 from chromeball.cli.calibrate.wand import wand
 
 app = App(name="calibrate", help="Cameras and their poses.")
-for _command in (exif, lens, match, pose, realign, track, tracker, undistort, wand):
+for _command in (convert, exif, lens, match, pose, realign, track, tracker, undistort, wand):
     app.command(_command)

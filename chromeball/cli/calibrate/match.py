@@ -75,6 +75,7 @@ def match(
         Print the figures as JSON.
 
     """
+    from chromeball.calibrate.formats import read_camera
     from chromeball.calibrate.match import BEND, NAMES
     from chromeball.calibrate.match import match as solve
     from chromeball.scene.camera import CameraModel
@@ -114,7 +115,7 @@ def match(
         world, pixels = [*world, *own], [*pixels, *map(list, clicked)]
     axes, ends = read_lines(lines) if lines is not None else ([], [])
     size = read_header(picture).size
-    lens = CameraModel.pinhole(size, 1.0) if camera is None else CameraModel.read(camera)
+    lens = CameraModel.pinhole(size, 1.0) if camera is None else read_camera(camera)
     if lens.size != size:
         raise UserError(
             "is for pictures of {}x{}, this one is {}x{}".format(*lens.size, *size), file=camera

@@ -25,29 +25,31 @@ def pose(
     Parameters
     ----------
     camera
-        The lens, a .cameramodel.
+        The lens, a .cameramodel or another file that `calibrate convert` reads.
     points
         Pixels of the corners in the order of align.json: "x,y x,y x,y x,y".
     align
         align.json of `envmap align`; its corners are the world points.
     output
-        The posed .cameramodel to write.
+        The posed .cameramodel to write; what else a .cameramodel of the lens holds is kept.
     sigma
         Standard deviation of a click in pixels, for the standard errors.
     json
         Print the figures as JSON.
 
     """
+    from chromeball.calibrate.formats import NamedCamera, encoded, read_camera
     from chromeball.calibrate.pose import solve_pose
-    from chromeball.scene.camera import CameraModel
 
+    if output.suffix != ".cameramodel":
+        raise UserError("a camera model's name ends in .cameramodel", file=output)
     if not 0 < sigma < 1e3:
         raise UserError(f"--sigma {sigma:g}: a click's error in pixels is positive")
     pixels = parse_pixels(points)
     corners = read_corners(align)
     if len(pixels) != len(corners):
         raise UserError(f"{len(pixels)} points were given, {align} has {len(corners)} corners")
-    unposed = CameraModel.read(camera)
+    unposed = read_camera(camera)
     options = {"camera": camera, "points": points, "align": align, "sigma": sigma}
     with Stage("calibrate pose", [camera, align], **options) as stage:
         found = solve_pose(unposed, corners, pixels, sigma=sigma)
@@ -63,7 +65,10 @@ def pose(
             }
         )
         with stage.output(output) as temporary:
-            unposed.posed(found.world_from_camera).write(temporary)
+            posed = unposed.posed(found.world_from_camera)
+            source = camera if camera.suffix == output.suffix else None
+            named = NamedCamera(output.stem, posed, source=source)
+            temporary.write_bytes(encoded([named], output, "cameramodel")[""])
     if found.ambiguous:
         say(
             "the clicks fit a second pose almost as well: click more exactly, or take the "

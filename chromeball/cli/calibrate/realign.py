@@ -44,14 +44,14 @@ def realign(
         Print the figures as JSON.
 
     """
+    from chromeball.calibrate.formats import read_camera
     from chromeball.calibrate.realign import realign as solve
-    from chromeball.scene.camera import CameraModel
 
     if output.suffix != ".cameramodel":
         raise UserError("a camera model's name ends in .cameramodel", file=output)
     if not 0 < sigma < 1e3:
         raise UserError(f"--sigma {sigma:g}: a click's error in pixels is positive")
-    before = CameraModel.read(camera)
+    before = read_camera(camera)
     points, pixels = read_pairs(pairs)
     with Stage(
         "calibrate realign", [camera, pairs], sigma=sigma, keep_place=keep_place

@@ -65,12 +65,12 @@ def tracker(
     import numpy as np
 
     from chromeball.calibrate.detect import Detection, detect_files
+    from chromeball.calibrate.formats import read_camera
     from chromeball.calibrate.target import parse_target
     from chromeball.calibrate.tracker import solve_tracker
     from chromeball.calibrate.tracker_file import figures, write_tracker
     from chromeball.calibrate.tracker_log import TrackerLog, read_log, read_times
     from chromeball.calibrate.tracker_plot import plot_differences
-    from chromeball.scene.camera import CameraModel
 
     for name, value in (
         ("--position-noise", position_noise),
@@ -85,7 +85,7 @@ def tracker(
         raise UserError(f"--window {window:g}: seconds, or 0 for none")
     if output.suffix != ".json":
         raise UserError("a calibrated tracker's name ends in .json", file=output)
-    board, lens, samples = parse_target(target), CameraModel.read(camera), read_log(log)
+    board, lens, samples = parse_target(target), read_camera(camera), read_log(log)
     clock = None
     if samples.times is not None:
         if times is None:

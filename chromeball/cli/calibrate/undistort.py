@@ -28,7 +28,7 @@ def undistort(
     image
         A picture by that lens, codes or radiance.
     camera
-        The lens, a .cameramodel.
+        The lens, a .cameramodel or another file that `calibrate convert` reads.
     output
         The picture to write; EXR for a scene-linear one.
     fov
@@ -37,16 +37,16 @@ def undistort(
         Print the figures as JSON.
 
     """
+    from chromeball.calibrate.formats import read_camera
     from chromeball.calibrate.undistort import undistort as resample
     from chromeball.calibrate.undistort import undistorted_camera
-    from chromeball.scene.camera import CameraModel
     from chromeball.scene.image import read_image, write_exr, write_picture
 
     source = read_image(image)
     if source.linear != (output.suffix.lower() == ".exr"):
         kind = "EXR" if source.linear else "PNG, JPEG or TIFF"
         raise UserError(f"a picture like {image} is written as {kind}", file=output)
-    model = CameraModel.read(camera)
+    model = read_camera(camera)
     target = undistorted_camera(model, None if fov is None else math.radians(fov))
     with Stage("calibrate undistort", [image, camera], fov=fov) as stage:
         try:

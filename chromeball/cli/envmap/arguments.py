@@ -73,9 +73,9 @@ def picture_size(picture: Path | None) -> tuple[int, int] | None:
 
 def read_camera(path: Path, size: tuple[int, int] | None, picture: Path | None) -> CameraModel:
     """A camera model that fits pictures of `size`."""
-    from chromeball.scene.camera import CameraModel
+    from chromeball.calibrate.formats import read_camera as read_any
 
-    model = CameraModel.read(path)
+    model = read_any(path)
     if size is not None and model.size != size:
         raise UserError(
             f"the camera's pictures are {model.size[0]}x{model.size[1]}, "

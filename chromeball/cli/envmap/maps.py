@@ -106,6 +106,7 @@ def target_map(kind: str, width: int | None, optics: Optics, source: Mapping) ->
 
     The width of ``cube-files`` is that of a face.
     """
+    from chromeball.calibrate.formats import read_camera
     from chromeball.envmap.mapping import (
         MAPPINGS,
         LatLong,
@@ -114,14 +115,13 @@ def target_map(kind: str, width: int | None, optics: Optics, source: Mapping) ->
         parse_lens,
         sized,
     )
-    from chromeball.scene.camera import CameraModel
 
     if kind == "fisheye":
         lens = optics.to_lens or optics.lens
         if optics.camera is not None and optics.to_lens is None:
             if optics.lens is not None:
                 raise UserError("a fisheye needs --lens or --camera, one of the two")
-            model = CameraModel.read(optics.camera)
+            model = read_camera(optics.camera)
             scale = width / model.size[0] if width else 1.0
             return of_camera(model.scaled(scale))
         if lens is None:

@@ -210,12 +210,12 @@ def _ball(ball: Path, circle: str, camera: Path) -> tuple[Any, Any]:
     """Normals (N, 3) in the world and radiance (N, 3) of a ball's picture, its rim left out."""
     import numpy as np
 
+    from chromeball.calibrate.formats import read_camera
     from chromeball.envmap.mapping import pixel_grid
     from chromeball.envmap.picture import read_radiance
-    from chromeball.scene.camera import CameraModel
 
     cx, cy, r = parse_numbers(circle, "--circle", 3)
-    picture, model = read_radiance(ball), CameraModel.read(camera)
+    picture, model = read_radiance(ball), read_camera(camera)
     if model.size != picture.size:
         raise UserError(f"the camera's pictures are {model.size[0]}x{model.size[1]}", file=ball)
     rim = model.unproject(np.array([[cx + r, cy], [cx - r, cy], [cx, cy + r], [cx, cy - r]]))
