@@ -10,7 +10,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bench import calibrate_fisheye, calibrate_targets, calibrate_tracker, calibrate_wand
+from bench import (
+    calibrate_fisheye,
+    calibrate_rig,
+    calibrate_targets,
+    calibrate_tracker,
+    calibrate_wand,
+)
 from bench.row import Row
 from chromeball.calibrate.choose import pose_errors
 from chromeball.calibrate.detect import detect
@@ -31,6 +37,7 @@ def rows(quick: bool) -> list[Row]:
         *_circles(count),
         *(_left() if DATA.is_dir() else []),
         *calibrate_fisheye.rows(quick),
+        *calibrate_rig.rows(quick),
         *calibrate_targets.rows(quick),
         *calibrate_tracker.rows(quick),
         *calibrate_wand.rows(quick),

@@ -89,7 +89,7 @@ def gradients(
 
 def camera_points(estimate: Estimate, board: NDArray[np.float64]) -> NDArray[np.float64]:
     """The corners as the entrance pupil sees them, in camera axes, (V, rows, columns, 3)."""
-    bowed = board + (_bow_shape(board) @ estimate.bow)[..., None] * [0.0, 0, 1]
+    bowed = board + (bow_shape(board) @ estimate.bow)[..., None] * [0.0, 0, 1]
     points = _turned(estimate, bowed) + estimate.translations[:, None, None]
     return _from_pupil(points, estimate.pupil)[0]
 
@@ -190,7 +190,7 @@ def _linearise(
     scale: float,
 ) -> tuple[float, Arrowhead]:
     """Cost, and J'J and J'e over the free unknowns; a pose's change is exp(w) R, t + dt."""
-    shape = _bow_shape(board)
+    shape = bow_shape(board)
     bowed = board + (shape @ estimate.bow)[..., None] * [0.0, 0, 1]
     turned = _turned(estimate, bowed)
     points, by_travel, of_point = _from_pupil(
@@ -273,7 +273,7 @@ def _from_pupil(
     return seen, powers, (slope / square)[..., None] * by_theta
 
 
-def _bow_shape(board: NDArray[np.float64]) -> NDArray[np.float64]:
+def bow_shape(board: NDArray[np.float64]) -> NDArray[np.float64]:
     """1 - x^2 and 1 - y^2, (rows, columns, 2)."""
     low, high = board.min(axis=(0, 1))[:2], board.max(axis=(0, 1))[:2]
     place = (2 * board[..., :2] - low - high) / np.where(high > low, high - low, 1)

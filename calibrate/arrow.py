@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -133,9 +133,17 @@ class Arrowhead:
             return np.full_like(self.shared, np.nan), math.inf
 
 
+class System(Protocol):
+    """Normal equations that know their damped step."""
+
+    def step(self, damping: float) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+        """Change of the shared (s,) and local (V, l) unknowns; None where singular."""
+        ...
+
+
 def descend[E](
     start: E,
-    linearise: Callable[[E], tuple[float, Arrowhead]],
+    linearise: Callable[[E], tuple[float, System]],
     move: Callable[[E, NDArray[np.float64], NDArray[np.float64]], E | None],
     *,
     steps: int,

@@ -8,11 +8,24 @@ from chromeball.cli.calibrate.lens import lens
 from chromeball.cli.calibrate.match import match
 from chromeball.cli.calibrate.pose import pose
 from chromeball.cli.calibrate.realign import realign
+from chromeball.cli.calibrate.rig import rig
 from chromeball.cli.calibrate.track import track
 from chromeball.cli.calibrate.tracker import tracker
 from chromeball.cli.calibrate.undistort import undistort
 from chromeball.cli.calibrate.wand import wand
 
 app = App(name="calibrate", help="Cameras and their poses.")
-for _command in (convert, exif, lens, match, pose, realign, track, tracker, undistort, wand):
+for _command in (
+    convert,
+    exif,
+    lens,
+    match,
+    pose,
+    realign,
+    rig,
+    track,
+    tracker,
+    undistort,
+    wand,
+):
     app.command(_command)

@@ -1,0 +1,376 @@
+"""A rig of cameras from pictures of one board: lenses, poses and bow in one solution.
+
+Each camera is calibrated by itself, the cameras are placed along a spanning tree, and then all
+is estimated together: with Cauchy's weights first, then by least squares on the corners that
+fit. Lens models may be mixed. Where the cameras disagree far more than each with itself and the
+pictures' times are known, their clocks are solved for (:mod:`chromeball.calibrate.rig_sync`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chromeball.calibrate import rig_solve
+from chromeball.calibrate.lens_result import check_focal
+from chromeball.calibrate.rig_lenses import Alone, calibrate_alone, place_alone
+from chromeball.calibrate.rig_solve import Layout, RigEstimate
+from chromeball.calibrate.rig_start import disconnected, groups, readings, start_rig
+from chromeball.calibrate.rig_sync import Sync, synchronise
+from chromeball.calibrate.target import Target
+from chromeball.scene.camera import CameraModel
+from chromeball.scene.errors import UserError
+from chromeball.scene.pose import Pose
+
+#: Together so many times less exact than each alone: the cameras did not look at once.
+DISAGREEMENT = 2.0
+#: Offsets are believed when they leave less than this share of the held-out error.
+WORTH = 0.8
+#: Reduced normal equations worse conditioned than this determine nothing.
+WORST_CONDITION = 1e13
+
+
+@dataclass(frozen=True)
+class RigSolution:
+    """C cameras before F instants of a board of R x K corners, and how well they are known.
+
+    ``cameras`` are posed, world_from_camera = rig_from_camera, the first at the origin.
+    ``covariance`` (6C, 6C): for each camera the turn about its own axes (radians) and its
+    position on the rig (metres), zero for the first. ``lens_covariance`` (k, k) of each lens,
+    zero for one that was given. ``observed`` (C, F, R, K, 2) and ``residuals``, projected minus
+    observed, NaN for outliers. ``sigma`` and ``alone`` (C,): deviation of a coordinate of a
+    corner here and in each camera by itself. ``rig_from_board`` (F, 4, 4), NaN where unknown.
+    ``turned`` (C, F): boards that were read from another end than their instant's.
+    ``repeated`` instants that show what an earlier one shows, and count for nothing.
+    ``condition`` of the reduced normal equations. ``sync`` where the cameras did not look at
+    once and the times are known.
+    """
+
+    names: tuple[str, ...]
+    cameras: tuple[CameraModel, ...]
+    covariance: NDArray[np.float64]
+    lens_covariance: tuple[NDArray[np.float64], ...]
+    bow: NDArray[np.float64]
+    observed: NDArray[np.float64]
+    residuals: NDArray[np.float64]
+    sigma: NDArray[np.float64]
+    alone: NDArray[np.float64]
+    rig_from_board: NDArray[np.float64]
+    turned: NDArray[np.bool_]
+    repeated: tuple[int, ...]
+    condition: float
+    sync: Sync | None
+
+    @property
+    def outliers(self) -> NDArray[np.bool_]:
+        """Corners that do not fit, (C, F, R, K)."""
+        return np.isfinite(self.observed[..., 0]) & np.isnan(self.residuals[..., 0])
+
+    @property
+    def rms(self) -> NDArray[np.float64]:
+        """RMS per corner of each camera over its inliers, pixels, (C,)."""
+        square = (self.residuals**2).sum(axis=-1)
+        return np.sqrt(np.nanmean(square.reshape(len(square), -1), axis=1))
+
+    @property
+    def disagreement(self) -> float:
+        """How many times less exact the cameras are together than alone."""
+        return float(np.median(self.sigma / self.alone))
+
+    @property
+    def common(self) -> NDArray[np.intp]:
+        """Instants that two cameras share, (C, C)."""
+        seen = np.isfinite(self.residuals[..., 0]).any(axis=(2, 3)).astype(np.intp)
+        return seen @ seen.T
+
+    @property
+    def position_errors(self) -> NDArray[np.float64]:
+        """Standard errors of the cameras' positions on the rig, metres, (C, 3)."""
+        return np.sqrt(np.diag(self.covariance)).reshape(-1, 6)[:, 3:]
+
+    @property
+    def turn_errors(self) -> NDArray[np.float64]:
+        """Standard errors of the cameras' turns about their own axes, radians, (C, 3)."""
+        return np.sqrt(np.diag(self.covariance)).reshape(-1, 6)[:, :3]
+
+    def misread(self) -> list[tuple[int, int]]:
+        """Camera and instant of views of which no corner fits."""
+        found = np.isfinite(self.observed[..., 0]).any(axis=(2, 3))
+        fits = np.isfinite(self.residuals[..., 0]).any(axis=(2, 3))
+        return [(int(c), int(v)) for c, v in np.argwhere(found & ~fits)]
+
+
+def calibrate_rig(
+    corners: NDArray[np.float64],
+    target: Target,
+    sizes: Sequence[tuple[int, int]],
+    names: Sequence[str],
+    *,
+    models: Sequence[str],
+    known: Mapping[str, CameraModel] | None = None,
+    refine: bool = False,
+    stamps: NDArray[np.float64] | None = None,
+    progress: Callable[[str], object] | None = None,
+) -> RigSolution:
+    """Lenses and poses of all cameras of a rig.
+
+    Parameters
+    ----------
+    corners
+        Pixels, (C, F, rows, columns, 2) for C cameras and F instants, NaN where missing.
+    target
+        The board.
+    sizes, names, models
+        Each camera's picture size, name and lens model, of
+        :data:`chromeball.calibrate.rig_lenses.MODELS`.
+    known, refine
+        Lenses that are given, by their cameras' names, and whether to refine them.
+    stamps
+        When each frame was taken, (C, F) seconds; only then can clocks be solved for.
+    progress
+        Hears of each step.
+
+    Raises
+    ------
+    UserError
+        When a camera's pictures do not determine its lens, the cameras fall into groups that
+        never see the board at once, or do not agree.
+
+    """
+    say: Callable[[str], object] = progress or (lambda _: None)
+    given = dict(known or {})
+    if len(names) < 2:
+        raise UserError("a rig has two cameras or more; for one take `calibrate lens`")
+    if unknown := sorted(set(given) - set(names)):
+        raise UserError(
+            f"no camera of the rig is called {unknown[0]!r}; they are {', '.join(names)}"
+        )
+    repeated = _repeated(corners)
+    corners = corners.copy()
+    corners[:, list(repeated)] = np.nan
+    _check_boards(corners, names)
+    alone: list[Alone] = []
+    for name, views, size, model in zip(names, corners, sizes, models, strict=True):
+        alone.append(_alone(name, views, target, size, model, given.get(name)))
+        say(f"{name}: {int(alone[-1].saw.sum())} boards, corner noise {alone[-1].sigma:.3f} px")
+    saw = np.array([a.saw for a in alone])
+    poses = np.array([a.camera_from_board for a in alone])
+    cameras = [_open(a.camera) for a in alone]
+    start = start_rig(names, cameras, poses, saw, target)
+    corners = np.where(saw[..., None, None, None], corners, np.nan)
+    corners = _reread(corners, start.turned, target)
+
+    board, share = target.points(), np.array([a.sigma for a in alone])
+    frozen = tuple(np.zeros(len(c.intrinsics), bool) for c in cameras)
+    free = tuple(
+        np.full(len(camera.intrinsics), refine or name not in given)
+        for name, camera in zip(names, cameras, strict=True)
+    )
+    fixed = rig_solve.robust(
+        start.estimate, board, corners, Layout.of(frozen, bow=False), share, rounds=3
+    )
+    layout = Layout.of(free, bow=True)
+    estimate = rig_solve.robust(fixed, board, corners, layout, share)
+    estimate, used, sigma = rig_solve.settle(estimate, board, corners, layout, share)
+    ratio = float(np.median(sigma / share))
+    say(f"together: {np.median(sigma):.3f} px, {ratio:.1f} times each camera alone")
+    sync: Sync | None = None
+    if ratio > DISAGREEMENT and stamps is not None:
+        tried = synchronise(fixed, corners, board, stamps, share)
+        if tried.held_out[1] < WORTH * tried.held_out[0]:
+            sync = tried
+            say(
+                "the cameras did not look at once: with their time offsets "
+                f"{tried.rms_before:.2f} px become {tried.rms:.2f}"
+            )
+    lenses = [a.covariance for a in alone]
+    if sync is not None:
+        estimate, covariance, sigma = (
+            _unmiddled(sync.motion.rig, board),
+            sync.covariance,
+            sync.sigma,
+        )
+        error = np.full(corners.shape, np.nan)
+        found = np.isfinite(corners[..., 0])
+        error[found] = np.where(sync.used[:, None], _errors(sync), np.nan)
+        condition = math.nan
+    else:
+        system = rig_solve.linearise(estimate, board, corners, used, layout, sigma)[1]
+        everything, condition = system.covariance()
+        if not condition < WORST_CONDITION:
+            raise UserError(
+                "these pictures do not determine the rig: take more, with the board tilted and "
+                "all over the pictures of neighbouring cameras"
+            )
+        columns = np.concatenate(layout.pose)
+        covariance = everything[np.ix_(columns, columns)]
+        for c, chosen in enumerate(layout.free):
+            if chosen.any():
+                lenses[c] = everything[np.ix_(layout.lens[c], layout.lens[c])]
+                values, spread = estimate.cameras[c].intrinsics, np.sqrt(np.diag(lenses[c]))
+                _named(names[c], check_focal, values, spread, 2 if len(values) > 3 else 1)
+        error = rig_solve.residuals(estimate, board, corners)
+        error[~used] = np.nan
+    _check_connected(error, names)
+    return RigSolution(
+        names=tuple(names),
+        cameras=tuple(_posed(estimate, c, alone[c].camera) for c in range(len(names))),
+        covariance=_on_rig(estimate, covariance),
+        lens_covariance=tuple(lenses),
+        bow=estimate.bow,
+        observed=corners,
+        residuals=error,
+        sigma=sigma,
+        alone=share,
+        rig_from_board=_boards(estimate, np.isfinite(error[..., 0]).any(axis=(0, 2, 3))),
+        turned=start.turned > 0,
+        repeated=repeated,
+        condition=condition,
+        sync=sync,
+    )
+
+
+# ---- steps
+
+
+def _repeated(corners: NDArray[np.float64]) -> tuple[int, ...]:
+    """Instants that show in every camera what an earlier one shows, to the last bit."""
+    first: dict[bytes, int] = {}
+    again: list[int] = []
+    for v in range(corners.shape[1]):
+        content = np.nan_to_num(corners[:, v], nan=-1.0)
+        if (content >= 0).any() and first.setdefault(content.tobytes(), v) != v:
+            again.append(v)
+    return tuple(again)
+
+
+def _check_boards(corners: NDArray[np.float64], names: Sequence[str]) -> None:
+    """Every camera sees boards, and some of them with another camera."""
+    seen = np.isfinite(corners[..., 0]).any(axis=(2, 3))
+    for c, name in enumerate(names):
+        if not seen[c].any():
+            raise UserError(f"camera {name} saw no board: is its folder the right one?")
+        others = np.delete(seen, c, axis=0).any(axis=0)
+        if not (seen[c] & others).any():
+            raise UserError(
+                f"camera {name} never sees the board at once with another camera: show it to "
+                f"{name} and a neighbour together, and check that their pictures have the same "
+                "names, numbers or times"
+            )
+
+
+def _alone(
+    name: str,
+    corners: NDArray[np.float64],
+    target: Target,
+    size: tuple[int, int],
+    model: str,
+    lens: CameraModel | None,
+) -> Alone:
+    if lens is None:
+        return _named(name, calibrate_alone, corners, target, size, model)
+    if lens.size != size:
+        raise UserError(
+            "camera {}: its lens is for pictures of {}x{}, these are {}x{}".format(
+                name, *lens.size, *size
+            )
+        )
+    return _named(name, place_alone, corners, target, lens)
+
+
+def _named[T](name: str, function: Callable[..., T], *arguments: Any) -> T:
+    """What `function` returns; its complaints with the camera's name."""
+    try:
+        return function(*arguments)
+    except UserError as error:
+        raise UserError(f"camera {name}: {error.what}") from error
+
+
+def _open(camera: CameraModel) -> CameraModel:
+    """Without pose, and a fisheye without an end to its field."""
+    return replace(camera, world_from_camera=Pose.identity(), max_angle=math.pi)
+
+
+def _reread(
+    corners: NDArray[np.float64], turned: NDArray[np.intp], target: Target
+) -> NDArray[np.float64]:
+    """`corners` with the readings that the cameras agree on."""
+    flat = corners.reshape(*corners.shape[:2], -1, 2).copy()
+    for reading, (_, order) in enumerate(readings(target)):
+        if reading:
+            flat[turned == reading] = flat[turned == reading][:, order]
+    return flat.reshape(corners.shape)
+
+
+def _errors(sync: Sync) -> NDArray[np.float64]:
+    from chromeball.calibrate.rig_motion import errors
+
+    return errors(sync.motion, sync.seen)
+
+
+def _unmiddled(rig: RigEstimate, board: NDArray[np.float64]) -> RigEstimate:
+    """Board poses of its first corner instead of its middle."""
+    middle = board.mean(axis=(0, 1))
+    return replace(
+        rig, board_translations=rig.board_translations - rig.board_rotations @ middle
+    )
+
+
+def _check_connected(error: NDArray[np.float64], names: Sequence[str]) -> None:
+    """The corners that fit still hold the cameras together."""
+    seen = np.isfinite(error[..., 0]).any(axis=(2, 3)).astype(np.intp)
+    if not seen.any(axis=1).all():
+        c = int(seen.any(axis=1).argmin())
+        raise UserError(
+            f"no board of camera {names[c]} fits the other cameras: are its pictures paired "
+            "rightly with theirs, and the board the same?"
+        )
+    if len(groups(seen @ seen.T)) > 1:
+        raise UserError(f"without misread boards {disconnected(names, seen @ seen.T)}")
+
+
+def _posed(estimate: RigEstimate, c: int, alone: CameraModel) -> CameraModel:
+    u, _, vt = np.linalg.svd(estimate.rotations[c])  # rounding alone
+    camera_from_rig = Pose(u @ vt, estimate.translations[c])
+    camera = replace(estimate.cameras[c], max_angle=alone.max_angle)
+    if camera.model == "kb4":
+        camera = replace(camera, max_angle=rising_until(camera))
+    return camera.posed(camera_from_rig.inverse())
+
+
+def rising_until(camera: CameraModel) -> float:
+    """The angle where the radius of Kannala and Brandt's lens stops to grow, radians."""
+    theta = np.linspace(0, math.pi, 2000)
+    powers = np.stack([(2 * i + 1) * theta ** (2 * i) for i in range(5)], axis=-1)
+    falls = np.flatnonzero(powers @ np.concatenate([[1.0], camera.intrinsics[4:]]) <= 0)
+    return float(theta[falls[0] - 1]) if len(falls) else math.pi
+
+
+def _on_rig(estimate: RigEstimate, covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Of the turns about the cameras' axes and their positions on the rig, (6C, 6C).
+
+    From that (6 (C - 1), 6 (C - 1)) of w and dt, exp(w) C, d + dt: the position is c = -C'd, so
+    that dc = -C' [d] w - C' dt.
+    """
+    count = len(estimate.rotations)
+    change = np.zeros((6 * count, 6 * (count - 1)))
+    for c in range(1, count):
+        back, d = estimate.rotations[c].T, estimate.translations[c]
+        at, own = 6 * c, 6 * (c - 1)
+        change[at : at + 3, own : own + 3] = -np.eye(3)
+        change[at + 3 : at + 6, own : own + 3] = back @ np.cross(np.eye(3), d).T
+        change[at + 3 : at + 6, own + 3 : own + 6] = -back
+    return change @ covariance @ change.T
+
+
+def _boards(estimate: RigEstimate, known: NDArray[np.bool_]) -> NDArray[np.float64]:
+    poses = np.full((len(known), 4, 4), np.nan)
+    poses[known] = np.eye(4)
+    poses[known, :3, :3] = estimate.board_rotations[known]
+    poses[known, :3, 3] = estimate.board_translations[known]
+    return poses
