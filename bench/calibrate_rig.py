@@ -183,7 +183,7 @@ def _webcams() -> list[Row]:
     board = Charuco(4, 5, 0.054, 0.0405, "4X4_1000")
     sources = find_sources([folder])
     plan = plan_pairs(sources, folder / "timestamps.csv")
-    views = look(sources, plan, board, inverted=True)
+    views = look(sources, plan, board)
     what = "four unsynchronised webcams, RMS over all corners"
     start = time.process_time()
     try:

@@ -124,10 +124,9 @@ def look(
     plan: Plan,
     target: Target,
     *,
-    inverted: bool = False,
     progress: Callable[[str], object] | None = None,
 ) -> Views:
-    """Find the board in all pictures of the `plan`; `inverted`: black and white are swapped.
+    """Find the board in all pictures of the `plan`.
 
     Raises
     ------
@@ -140,6 +139,7 @@ def look(
     for c, source in enumerate(sources):
         wanted = {int(frame): v for v, frame in enumerate(plan.frames[c]) if frame >= 0}
         size: tuple[int, int] | None = None
+        verdicts: list[str] = []
         for frame, path, picture in _pictures(source, sorted(wanted)):
             if size is not None and picture.shape[::-1] != size:
                 raise UserError(
@@ -148,7 +148,8 @@ def look(
                     file=path,
                 )
             size = (picture.shape[1], picture.shape[0])
-            seen = judge(path, np.asarray(255 - picture if inverted else picture), target)
+            seen = judge(path, picture, target)
+            verdicts.append(seen.verdict)
             if seen.usable:
                 corners[c, wanted[frame]] = seen.corners
             if progress is not None:
@@ -157,11 +158,13 @@ def look(
         if size is None:
             raise UserError(f"camera {source.name} has no picture of any instant")
         sizes.append(size)
-    if not np.isfinite(corners).any():
-        raise UserError(
-            f"the board {target.spec} was not seen in any picture: check its counts (a "
-            f"chessboard's are inner corners), focus and light; {FEWEST} corners are needed"
-        )
+        if not np.isfinite(corners[c]).any():
+            common = max(set(verdicts), key=verdicts.count)
+            raise UserError(
+                f"camera {source.name}: the board {target.spec} is usable in none of its "
+                f"{len(verdicts)} pictures ({common}): check its counts (a chessboard's are "
+                f"inner corners), focus and light; {FEWEST} corners are needed"
+            )
     return Views(tuple(s.name for s in sources), tuple(sizes), corners, plan)
 
 

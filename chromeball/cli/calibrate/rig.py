@@ -28,7 +28,6 @@ def rig(
     refine: Annotated[bool, Parameter(negative="")] = False,
     times: Path | None = None,
     every: int = 1,
-    inverted: Annotated[bool, Parameter(negative="")] = False,
     distance: str | None = None,
     json: Json = False,
 ) -> None:
@@ -58,8 +57,6 @@ def rig(
         A table (CSV) with columns camera, frame, time in seconds, and maybe instant.
     every
         Use every second, third ... instant alone.
-    inverted
-        The board is white on black.
     distance
         A length to check the scale by, LEFT:RIGHT:METRES between two cameras.
     json
@@ -89,11 +86,11 @@ def rig(
     inputs += [times] if times else []
     options = {
         "target": target, "model": models, "refine": refine, "every": every,
-        "inverted": inverted, "distance": distance,
+        "distance": distance,
     }  # fmt: skip
     with Stage("calibrate rig", inputs, **options) as stage:
         plan = plan_pairs(sources, times, every)
-        views = look(sources, plan, board, inverted=inverted, progress=say)
+        views = look(sources, plan, board, progress=say)
         solution = calibrate_rig(
             views.corners, board, views.sizes, names,
             models=models, known=known, refine=refine, stamps=plan.stamps, progress=say,
