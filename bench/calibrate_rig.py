@@ -59,7 +59,8 @@ def _ring(seeds: int, share: float, wide: tuple[int, ...]) -> list[Row]:
             if tool == "chromeball":
                 models = ["kb4" if c.model == "kb4" else "opencv4" for c in truth]
                 sizes, names = [c.size for c in truth], [f"{c}" for c in range(8)]
-                found = calibrate_rig(corners, BOARD, sizes, names, models=models).cameras
+                rig = calibrate_rig(corners, BOARD, sizes, names, models=models)
+                found = list(rig.cameras)
             else:
                 found = _mrcal(corners, truth[0].size)
             seconds[tool] = min(seconds[tool], _cpu() - start)

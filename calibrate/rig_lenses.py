@@ -156,12 +156,12 @@ def _search(corners: Corners, board: Corners, size: tuple[int, int]) -> Estimate
     tried.sort(key=lambda pair: pair[0])
     core, least = np.arange(10) < 4, math.inf
     best = tried[0][1]
-    for _, start in tried[:2]:
-        saw = start.seen
-        estimate = _fit(start.estimate, board, corners[saw], core, rounds=1)
+    for _, candidate in tried[:2]:
+        saw = candidate.seen
+        estimate = _fit(candidate.estimate, board, corners[saw], core, rounds=1)
         miss = _median(estimate, board, corners, saw)
         if miss < least:
-            best, least = replace(start, estimate=estimate), miss
+            best, least = _Tried(estimate, saw), miss
     return _fit(best.estimate, board, corners[best.seen], np.ones(10, bool), rounds=2)
 
 

@@ -92,8 +92,8 @@ def place_boards(
     for view, seen in enumerate(np.isfinite(rays).all(axis=-1)):
         if seen.sum() < FEWEST_CORNERS:
             continue
-        if poses := start_poses(board[seen], rays[view][seen]):
-            starts.append((view, poses))
+        if rivals := start_poses(board[seen], rays[view][seen]):
+            starts.append((view, rivals))
     poses = np.tile(np.eye(4), (len(corners), 1, 1))
     least = np.full(len(corners), math.inf)
     if not refine:
