@@ -181,6 +181,8 @@ def calibrate_rig(
     say(f"together: {np.median(sigma):.3f} px, {ratio:.1f} times each camera alone")
     sync: Sync | None = None
     if ratio > DISAGREEMENT and stamps is not None:
+        seen = np.isfinite(rig_solve.residuals(fixed, board, corners))
+        corners = np.where(seen, corners, np.nan)
         tried = synchronise(fixed, corners, board, stamps, share)
         if tried.held_out[1] < WORTH * tried.held_out[0]:
             sync = tried

@@ -8,16 +8,15 @@ wanted, and all fitted with Cauchy's weights. The joint solution has the last wo
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from chromeball.calibrate import solve_fisheye, solve_mrcal
-from chromeball.calibrate.adjust import Estimate, adjust, covariance, gradients, residuals
-from chromeball.calibrate.lens import FEWEST_VIEWS, choose_model
+from chromeball.calibrate.adjust import Estimate, adjust, camera_points, covariance, residuals
+from chromeball.calibrate.choose import choose_model
+from chromeball.calibrate.convert import converted
+from chromeball.calibrate.lens import FEWEST_VIEWS, OPENCV
 from chromeball.calibrate.lens_result import LEAST_TILT, PARALLEL, check_focal
 from chromeball.calibrate.rig_solve import (
     BOW_DEVIATION,
@@ -27,12 +26,13 @@ from chromeball.calibrate.rig_solve import (
     OUTLIER,
 )
 from chromeball.calibrate.rig_start import place_boards
+from chromeball.calibrate.solve import FISHEYES, UNEXPLAINED
 from chromeball.calibrate.target import Target
 from chromeball.scene.camera import CameraModel
 from chromeball.scene.errors import UserError
 
 #: A splined lens has too many unknowns for a start from few boards: it can be given.
-MODELS = ("auto", *solve_mrcal.MODELS[:4], *solve_fisheye.MODELS)
+MODELS = ("auto", "pinhole", *OPENCV, *FISHEYES)
 #: Fields of view across the longer side tried as a start, degrees.
 FIELDS_OF_VIEW = (25, 45, 70, 100, 140, 185, 230, 290)
 #: Views that the search and the fit need; they are taken evenly from the session.
@@ -79,24 +79,31 @@ def calibrate_alone(
     fitted = _evenly(views, FIT_VIEWS)
     chosen = corners[fitted]
     if model == "auto":
-        model, _ = choose_model(chosen, target, size)
+        model = choose_model(chosen, target, size).model
     board = target.points()
     rough = _search(corners[_evenly(views, SEARCH_VIEWS)], board, size)
-    camera = rough.camera if model == "kb4" else _converted(rough.camera, model, chosen)
+    camera = rough.camera
+    if model != "kb4":
+        points = camera_points(rough, board).reshape(-1, 3)
+        rays = points / np.linalg.norm(points, axis=-1, keepdims=True)
+        name = f"LENSMODEL_{model.upper()}" if model in OPENCV else model
+        camera, _ = converted(camera, name, rays)
     poses, saw = place_boards(camera, board, chosen)
     if saw.sum() < FEWEST_VIEWS:
-        raise UserError(solve_fisheye.UNEXPLAINED)
+        raise UserError(UNEXPLAINED)
     normals = poses[saw, :3, 2]
     if np.arccos(np.clip(normals @ normals.T, -1, 1)).max() < LEAST_TILT:
         raise UserError(PARALLEL)
     start = Estimate(camera, np.zeros(2), poses[saw, :3, :3], poses[saw, :3, 3])
-    unknown = np.ones(len(camera.intrinsics) + 2, bool)
+    unknown = np.arange(len(camera.intrinsics) + 4) < len(camera.intrinsics) + 2
     estimate = _fit(start, board, chosen[saw], unknown, rounds=2)
     error = residuals(estimate, board, chosen[saw])
     sigma = _sigma(error, int(unknown.sum() + 6 * saw.sum()))
     used = np.hypot(error[..., 0], error[..., 1]) < OUTLIER * sigma
     k = len(camera.intrinsics)
-    known, _ = covariance(estimate, board, chosen[saw], used, _precision(k, board, sigma))
+    known, _ = covariance(
+        estimate, board, chosen[saw], used, _precision(k, board, sigma), unknown
+    )
     spread = sigma**2 * known[:k, :k]
     check_focal(estimate.camera.intrinsics, np.sqrt(np.diag(spread)), 2 if k > 3 else 1)
     if len(fitted) < len(views):
@@ -152,9 +159,9 @@ def _search(corners: Corners, board: Corners, size: tuple[int, int]) -> Estimate
         start = Estimate(camera, np.zeros(2), poses[saw, :3, :3], poses[saw, :3, 3])
         tried.append((_median(start, board, corners, saw), _Tried(start, saw)))
     if not tried:
-        raise UserError(solve_fisheye.UNEXPLAINED)
+        raise UserError(UNEXPLAINED)
     tried.sort(key=lambda pair: pair[0])
-    core, least = np.arange(10) < 4, math.inf
+    core, least = np.arange(12) < 4, math.inf
     best = tried[0][1]
     for _, candidate in tried[:2]:
         saw = candidate.seen
@@ -162,7 +169,7 @@ def _search(corners: Corners, board: Corners, size: tuple[int, int]) -> Estimate
         miss = _median(estimate, board, corners, saw)
         if miss < least:
             best, least = _Tried(estimate, saw), miss
-    return _fit(best.estimate, board, corners[best.seen], np.ones(10, bool), rounds=2)
+    return _fit(best.estimate, board, corners[best.seen], np.arange(12) < 10, rounds=2)
 
 
 def _fit(
@@ -173,11 +180,11 @@ def _fit(
     rounds: int = 3,
 ) -> Estimate:
     """Cauchy's estimate, its scale renewed from the residuals."""
-    found = np.isfinite(corners[..., 0])
     for _ in range(rounds):
-        sigma = float(np.nanmedian(_distance(estimate, board, corners)))
+        distance = _distance(estimate, board, corners)
+        found, sigma = np.isfinite(distance), float(np.nanmedian(distance))
         sigma = max(sigma / math.sqrt(2 * math.log(2)), 1e-6)
-        known = _precision(len(free) - 2, board, sigma)
+        known = _precision(len(free) - 4, board, sigma)
         estimate = adjust(
             estimate, board, corners, found,
             free=free, precision=known, scale=CAUCHY * sigma, steps=12, least_gain=1e-4,
@@ -186,11 +193,11 @@ def _fit(
 
 
 def _precision(intrinsics: int, board: Corners, sigma: float) -> Corners:
-    """Inverse variances of weak knowledge, times sigma squared, (intrinsics + 2,)."""
-    known = np.zeros(intrinsics + 2)
+    """Inverse variances of weak knowledge, times sigma squared, (intrinsics + 4,)."""
+    known = np.zeros(intrinsics + 4)
     known[4:intrinsics] = (sigma / K_DEVIATION) ** 2
     width = float(np.ptp(board[..., :2], axis=(0, 1)).max())
-    known[intrinsics:] = (sigma / (BOW_DEVIATION * width)) ** 2
+    known[intrinsics : intrinsics + 2] = (sigma / (BOW_DEVIATION * width)) ** 2
     return known
 
 
@@ -218,39 +225,3 @@ def _distance(estimate: Estimate, board: Corners, corners: Corners) -> Corners:
     error = residuals(estimate, board, corners)
     length = np.hypot(error[..., 0], error[..., 1])
     return np.where(np.isfinite(corners[..., 0]) & np.isnan(length), math.inf, length)
-
-
-def _converted(camera: CameraModel, model: str, corners: Corners) -> CameraModel:
-    """A lens of `model` as like `camera` as can be where the corners are."""
-    from scipy.optimize import least_squares
-
-    pixels = corners[np.isfinite(corners[..., 0])]
-    pixels = pixels[:: max(1, len(pixels) // 400)]
-    rays = camera.unproject(pixels)
-    f, fy, cx, cy = camera.intrinsics[:4]
-    start: Sequence[float] = (f, cx, cy)
-    name = model
-    if model not in solve_fisheye.MODELS:
-        # OpenCV's models end at 90 degrees.
-        known = rays[:, 2] > math.cos(math.radians(85))
-        pixels, rays = pixels[known], rays[known]
-        name = "pinhole" if model == "pinhole" else f"LENSMODEL_{model.upper()}"
-        terms = 0 if model == "pinhole" else int(model.removeprefix("opencv"))
-        start = (f, fy, cx, cy, *[0.0] * terms)
-    known = np.isfinite(rays).all(axis=-1)
-    pixels, rays = pixels[known], rays[known]
-    if len(rays) < len(start):
-        raise UserError(f"{model} does not reach where the corners are: choose kb4")
-
-    def miss(intrinsics: Corners) -> Corners:
-        seen = gradients(CameraModel(name, intrinsics, camera.size), rays)[0]
-        return np.nan_to_num((seen - pixels).ravel(), nan=1e3)
-
-    def slope(intrinsics: Corners) -> Corners:
-        by_intrinsics = gradients(CameraModel(name, intrinsics, camera.size), rays)[2]
-        return np.nan_to_num(by_intrinsics.reshape(-1, len(intrinsics)))
-
-    scale = np.where(np.arange(len(start)) < min(4, len(start)), float(f), 1.0)
-    solver: Any = least_squares
-    fit = solver(miss, np.array(start), slope, x_scale=scale, loss="soft_l1")
-    return CameraModel(name, np.asarray(fit.x, float), camera.size)

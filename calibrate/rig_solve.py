@@ -202,11 +202,13 @@ def robust(
     `share` (C,) are the cameras' deviations of a corner in proportion to each other. They stay:
     deviations of their own would let one camera fit itself perfectly and forget the others.
     """
-    found = np.isfinite(corners[..., 0])
     for _ in range(rounds):
-        sigma = robust_sigma(residuals(estimate, board, corners), share)
+        error = residuals(estimate, board, corners)
+        sigma = robust_sigma(error, share)
+        # A misread board may lie where its lens does not see at all.
+        seen = np.isfinite(error[..., 0])
         estimate = adjust_rig(
-            estimate, board, corners, found, layout, sigma,
+            estimate, board, corners, seen, layout, sigma,
             scale=CAUCHY, steps=12, least_gain=1e-4,
         )  # fmt: skip
     return estimate

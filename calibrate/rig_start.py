@@ -100,7 +100,7 @@ def place_boards(
         for view, (first, *_) in starts:
             poses[view], least[view] = first.matrix(), 0.0
         return poses, np.isfinite(least)
-    none = np.zeros(len(camera.intrinsics) + 2)
+    none = np.zeros(len(camera.intrinsics) + 4)
     for rival in range(2):
         chosen = [(view, p[rival]) for view, p in starts if len(p) > rival]
         if not chosen:
