@@ -18,21 +18,31 @@ def projection_covariance(
 ) -> NDArray[np.float64]:
     """Covariance (..., 2, 2) of where points at infinity along unit `rays` are seen, px^2.
 
-    `covariance` (k, k) is that of the intrinsics. Other intrinsics look like a turned camera
-    in part, which no use of the lens minds: the turn w that fits best over the `support`, unit
-    rays (N, 3) to where corners were seen, is taken out, dq = dq/di di + dq/dp (w x p) (Kogan's
-    mrcal). It is the error from corner noise alone; what the model cannot express is not in it.
+    `covariance` (k, k) is that of the intrinsics; see :func:`projection_slopes`. It is the error
+    from corner noise alone; what the model cannot express is not in it.
+    """
+    j = projection_slopes(camera, support, rays)
+    return np.asarray(j @ covariance @ np.swapaxes(j, -1, -2), float)
+
+
+def projection_slopes(
+    camera: CameraModel, support: NDArray[np.float64], rays: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """How pixels of unit `rays` (..., 3) move with the intrinsics, (..., 2, k).
+
+    Other intrinsics look like a turned camera in part, which no use of the lens minds: the turn
+    w that fits best over the `support`, unit rays (N, 3) to where corners were seen, is taken
+    out, dq = dq/di di + dq/dp (w x p) (Kogan's mrcal).
     """
     by_turn, by_intrinsics = _sensitivity(camera, support)
     known = np.isfinite(by_turn).all(axis=(1, 2))
     w = -np.linalg.lstsq(
         by_turn[known].reshape(-1, 3),
-        by_intrinsics[known].reshape(-1, len(covariance)),
+        by_intrinsics[known].reshape(-1, len(camera.intrinsics)),
         rcond=None,
     )[0]
     by_turn, by_intrinsics = _sensitivity(camera, rays)
-    j = by_intrinsics + by_turn @ w
-    return np.asarray(j @ covariance @ np.swapaxes(j, -1, -2), float)
+    return by_intrinsics + by_turn @ w
 
 
 def camera_uncertainty(camera: CameraModel, rays: NDArray[np.float64]) -> NDArray[np.float64]:
