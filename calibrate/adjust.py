@@ -177,6 +177,33 @@ def covariance(
     return whole, condition
 
 
+def derivatives(
+    estimate: Estimate, board: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Pixels (V, rows, columns, 2) of the board's corners and how they move.
+
+    With intrinsics, bow and pupil, (V, rows, columns, 2, k + 4); with the view's pose,
+    exp(w) R and t + dt, (V, rows, columns, 2, 6).
+    """
+    shape = bow_shape(board)
+    bowed = board + (shape @ estimate.bow)[..., None] * [0.0, 0, 1]
+    turned = _turned(estimate, bowed)
+    points, by_travel, of_point = _from_pupil(
+        turned + estimate.translations[:, None, None], estimate.pupil
+    )
+    q, by_seen, by_intrinsics = gradients(estimate.camera, points)
+    # p' = p - s(p) e_z: d q / d p = d q / d p' - (d q / d p') e_z ds/dp
+    by_z = by_seen[..., 2]
+    by_point = by_seen - by_z[..., None] * of_point[..., None, :]
+    by_pupil = -by_z[..., None] * by_travel[..., None, :]
+    # d pixel / d bow = d pixel / d point R e_z (1 - x^2)
+    normals = estimate.rotations[:, None, None, :, 2, None]
+    by_bow = (by_point @ normals) * shape[:, :, None]
+    shared = np.concatenate([by_intrinsics, by_bow, by_pupil], axis=-1)
+    by_turn = np.cross(turned[..., None, :], by_point)
+    return q, shared, np.concatenate([by_turn, by_point], axis=-1)
+
+
 # ---- the normal equations
 
 
@@ -190,27 +217,12 @@ def _linearise(
     scale: float,
 ) -> tuple[float, Arrowhead]:
     """Cost, and J'J and J'e over the free unknowns; a pose's change is exp(w) R, t + dt."""
-    shape = bow_shape(board)
-    bowed = board + (shape @ estimate.bow)[..., None] * [0.0, 0, 1]
-    turned = _turned(estimate, bowed)
-    points, by_travel, of_point = _from_pupil(
-        turned + estimate.translations[:, None, None], estimate.pupil
-    )
-    q, by_seen, by_intrinsics = gradients(estimate.camera, points)
-    # p' = p - s(p) e_z: d q / d p = d q / d p' - (d q / d p') e_z ds/dp
-    by_z = by_seen[..., 2]
-    by_point = by_seen - by_z[..., None] * of_point[..., None, :]
-    by_pupil = -by_z[..., None] * by_travel[..., None, :]
+    q, by_shared, pose = derivatives(estimate, board)
     views = len(corners)
     error = np.where(used[..., None], q - corners, 0.0)
     square = (error**2).sum(axis=-1)
     cost, weight = cauchy(square, used, scale)
-    # d pixel / d bow = d pixel / d point R e_z (1 - x^2)
-    normals = estimate.rotations[:, None, None, :, 2, None]
-    by_bow = (by_point @ normals) * shape[:, :, None]
-    shared = np.concatenate([by_intrinsics, by_bow, by_pupil], axis=-1)[..., free]
-    by_turn = np.cross(turned[..., None, :], by_point)
-    pose = np.concatenate([by_turn, by_point], axis=-1)
+    shared = by_shared[..., free]
     unused = ~used
     shared[unused], pose[unused] = 0.0, 0.0
 

@@ -9,12 +9,12 @@ that lowers the error of projection over the picture most.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from chromeball.calibrate.adjust import Estimate, camera_points, gradients
+from chromeball.calibrate.adjust import Estimate, derivatives
 from chromeball.calibrate.convert import converted
 from chromeball.calibrate.lens_result import Lens
 from chromeball.calibrate.solve import BOW_DEVIATION, K_DEVIATION, PUPIL_DEVIATION
@@ -32,13 +32,14 @@ GOOD_SHARE = 0.95
 REACH = 0.1
 #: There a lens is only extrapolated: so much is added to its error, pixels.
 UNSEEN = 2.0
-#: What a person is asked for: sizes of the board as shares of the picture's longer side, degrees.
+#: What a person is asked for: the board's size as a share of the longer side, and degrees.
 SIZES, TILT = (0.3, 0.5, 0.8), 30.0
 #: Nobody takes more views than so many without looking again.
 MOST = 8
 
 PLACES = (
-    ("top left corner", 1 / 8, 1 / 8), ("top edge", 1 / 2, 1 / 8), ("top right corner", 7 / 8, 1 / 8),
+    ("top left corner", 1 / 8, 1 / 8), ("top edge", 1 / 2, 1 / 8),
+    ("top right corner", 7 / 8, 1 / 8),
     ("left edge", 1 / 8, 1 / 2), ("middle", 1 / 2, 1 / 2), ("right edge", 7 / 8, 1 / 2),
     ("bottom left corner", 1 / 8, 7 / 8), ("bottom edge", 1 / 2, 7 / 8),
     ("bottom right corner", 7 / 8, 7 / 8),
@@ -69,7 +70,8 @@ class Knowledge:
 
     ``pixels`` (n, 2) over the picture, ``slopes`` (n, 2, s) of projection there, NaN where the
     lens does not reach; ``seen`` (n,), where corners tell; ``information`` (s, s) of the
-    unknowns; ``estimate`` the lens; ``sigma`` the deviation of a corner, pixels.
+    unknowns; ``estimate`` the lens; ``sigma`` the deviation of a corner, pixels; ``places``
+    (rows, columns) of the target's grid that have a corner.
     """
 
     pixels: NDArray[np.float64]
@@ -78,6 +80,7 @@ class Knowledge:
     information: NDArray[np.float64]
     estimate: Estimate
     sigma: float
+    places: NDArray[np.bool_]
 
     def deviation(self) -> NDArray[np.float64]:
         """Of projection in the worst direction, from corner noise, (n,) pixels."""
@@ -115,7 +118,8 @@ def knowledge(lens: Lens, target: Target, pixels: NDArray[np.float64]) -> Knowle
         [slopes, np.zeros((len(pixels), 2, len(information) - slopes.shape[-1]))], axis=-1
     )
     seen = near_corners(pixels, lens.observed[used], lens.camera.size, lens.hull())
-    return Knowledge(pixels, slopes, seen, information, estimate, lens.sigma)
+    places = np.isfinite(lens.observed[..., 0]).any(axis=0)
+    return Knowledge(pixels, slopes, seen, information, estimate, lens.sigma, places)
 
 
 def view_information(
@@ -125,26 +129,18 @@ def view_information(
 
     (V, s, s), s = k + 2, or k + 4 where the pupil travels; `used` (V, rows, columns).
     """
-    points = camera_points(estimate, board)
-    _, by_point, by_intrinsics = gradients(estimate.camera, points)
-    low, high = board.min(axis=(0, 1))[:2], board.max(axis=(0, 1))[:2]
-    bow = 1 - ((2 * board[..., :2] - low - high) / (high - low)) ** 2
-    normals = estimate.rotations[:, None, None, :, 2, None]
-    shared = [by_intrinsics, (by_point @ normals) * bow[:, :, None]]
-    if estimate.pupil.any():
-        theta = np.arctan2(np.hypot(points[..., 0], points[..., 1]), points[..., 2])
-        travel = np.stack([theta**2, theta**4], axis=-1)
-        shared.append(-by_point[..., 2, None] * travel[..., None, :])
-    turned = points - estimate.translations[:, None, None]
-    own = np.concatenate([np.cross(turned[..., None, :], by_point), by_point], axis=-1)
-    a = np.where(used[..., None, None], np.concatenate(shared, axis=-1), 0.0)
+    _, shared, own = derivatives(estimate, board)
+    unknowns = len(estimate.camera.intrinsics) + (4 if estimate.pupil.any() else 2)
+    a = np.where(used[..., None, None], shared[..., :unknowns], 0.0)
     b = np.where(used[..., None, None], own, 0.0)
     a, b = (m.reshape(len(m), -1, m.shape[-1]) for m in (a, b))
     # Unknowns in units of their own, else metres and radians meet badly.
     b = b / np.maximum(np.linalg.norm(b, axis=1, keepdims=True), 1e-12)
     between = np.swapaxes(b, 1, 2) @ a
     pose = np.swapaxes(b, 1, 2) @ b
-    return np.swapaxes(a, 1, 2) @ a - np.swapaxes(between, 1, 2) @ np.linalg.solve(pose, between)
+    return np.swapaxes(a, 1, 2) @ a - np.swapaxes(between, 1, 2) @ np.linalg.solve(
+        pose, between
+    )
 
 
 def near_corners(
@@ -199,39 +195,65 @@ def next_views(
     at least `fewest` and at most `most`; `worse` is how many times the true error is that of
     corner noise. `from_among` replaces :func:`candidates`.
     """
-    views = candidates(known, target, lit) if from_among is None else from_among
-    lit = np.ones(len(known.pixels), bool) if lit is None else lit
+    shown = np.ones(len(known.pixels), bool) if lit is None else lit
     chosen: list[View] = []
+    if fewest == 0 and np.mean(worse * known.error()[shown] < GOOD) >= GOOD_SHARE:
+        return chosen, known
+    views = candidates(known, target, lit) if from_among is None else from_among
     if not views:
         return chosen, known
     estimate = _at(known.estimate, [v.camera_from_board for v in views])
     board = target.points()
-    used = np.ones((len(views), *board.shape[:2]), bool)
+    used = np.broadcast_to(known.places, (len(views), *board.shape[:2]))
     gains = view_information(estimate, board, used) / known.sigma**2
     size = known.estimate.camera.size
-    shows = [near_corners(known.pixels, v.corners.reshape(-1, 2), size) for v in views]
+    shows = [near_corners(known.pixels, v.corners[known.places], size) for v in views]
     while len(chosen) < most:
-        error = worse * known.error()[lit]
+        error = worse * known.error()[shown]
         if len(chosen) >= fewest and np.mean(error < GOOD) >= GOOD_SHARE:
             break
         costs = [
-            _cost(known.slopes[lit], known.information + gain, (known.seen | show)[lit], worse)
+            _cost(
+                known.slopes[shown], known.information + gain, (known.seen | show)[shown], worse
+            )
             for gain, show in zip(gains, shows, strict=True)
         ]
         best = int(np.argmin(costs))
-        before = _cost(known.slopes[lit], known.information, known.seen[lit], worse)
+        before = _cost(known.slopes[shown], known.information, known.seen[shown], worse)
         if len(chosen) >= fewest and before - costs[best] < 0.002:
             break
         chosen.append(views[best])
-        known = Knowledge(
-            known.pixels,
-            known.slopes,
-            known.seen | shows[best],
-            known.information + gains[best],
-            known.estimate,
-            known.sigma,
+        known = replace(
+            known,
+            seen=known.seen | shows[best],
+            information=known.information + gains[best],
         )
     return chosen, known
+
+
+def slants(lens: Lens) -> NDArray[np.float64]:
+    """How boards slant against the ray to their middle, (n, 2) radians.
+
+    Right edge nearer and top edge nearer, of the picture as the camera sees it.
+    """
+    posed = lens.camera_from_board[np.isfinite(lens.camera_from_board).all(axis=-1)]
+    found: list[NDArray[np.float64]] = []
+    for row in posed:
+        pose = Pose.from_rotation_vector(row[:3], row[3:])
+        # The normal from the board's back, in axes whose z is the ray to the board.
+        normal = _turn_to(pose.translation).T @ pose.rotation[:, 2]
+        across = float(np.hypot(normal[0], normal[1]))
+        angle = math.atan2(across, float(normal[2]))
+        found.append(normal[:2] * [1, -1] / max(across, 1e-12) * angle)
+    return np.array(found).reshape(-1, 2)
+
+
+def _turn_to(ray: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The least rotation that takes the optical axis to a direction."""
+    across = np.cross([0.0, 0.0, 1.0], ray / np.linalg.norm(ray))
+    sine = float(np.linalg.norm(across))
+    turn = across / max(sine, 1e-12) * math.atan2(sine, float(ray[2] / np.linalg.norm(ray)))
+    return Pose.from_rotation_vector(turn, np.zeros(3)).rotation
 
 
 def _cost(
@@ -240,7 +262,7 @@ def _cost(
     seen: NDArray[np.bool_],
     worse: float,
 ) -> float:
-    """Mean logarithm of the error, beyond the picture's reach none: below GOOD it gains little."""
+    """Mean logarithm of the error where the lens reaches; below GOOD little is gained."""
     error = worse * _error(_deviation(slopes, np.linalg.inv(information)), seen)
     error = error[np.isfinite(error)]
     return float(np.log(GOOD**2 + error**2).mean() / 2) if error.size else 0.0
@@ -276,7 +298,7 @@ def _candidate(
     wanted = np.array(at) * camera.size
     margin = 0.01 * max(camera.size)
     dark = None if lit is None else cKDTree(known.pixels)
-    for pull in np.linspace(1, 0, 14):
+    for pull in np.linspace(1, 0, 9):
         ray = camera.unproject(middle + pull * (wanted - middle))
         if not np.isfinite(ray).all():
             continue
@@ -300,18 +322,12 @@ def _facing(
     extent: float,
 ) -> Pose | None:
     """A board on `ray`, facing the camera but for its tilt, `extent` pixels large."""
-    across = np.cross([0.0, 0.0, 1.0], ray)
-    sine = float(np.linalg.norm(across))
-    turn = across / max(sine, 1e-12) * math.atan2(sine, float(ray[2]))
     tilt = math.radians(TILT) * np.array([*axis, 0.0])
-    rotation = (
-        Pose.from_rotation_vector(turn, np.zeros(3)).rotation
-        @ Pose.from_rotation_vector(tilt, np.zeros(3)).rotation
-    )
+    rotation = _turn_to(ray) @ Pose.from_rotation_vector(tilt, np.zeros(3)).rotation
     middle = (board.min(axis=0) + board.max(axis=0)) / 2
     distance = 2 * float(np.linalg.norm(np.ptp(board, axis=0)))
     pose = None
-    for _ in range(6):
+    for _ in range(4):
         pose = Pose(rotation, distance * ray - rotation @ middle)
         seen = camera.project(pose.apply(board))
         if not np.isfinite(seen).all():
@@ -353,4 +369,3 @@ def _rays(camera: CameraModel, pixels: NDArray[np.float64]) -> NDArray[np.float6
     with np.errstate(invalid="ignore"):
         miss = np.linalg.norm(camera.project(rays) - pixels, axis=-1)
     return np.where((miss < 0.1)[..., None], rays, np.nan)
-

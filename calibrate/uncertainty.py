@@ -18,8 +18,8 @@ def projection_covariance(
 ) -> NDArray[np.float64]:
     """Covariance (..., 2, 2) of where points at infinity along unit `rays` are seen, px^2.
 
-    `covariance` (k, k) is that of the intrinsics; see :func:`projection_slopes`. It is the error
-    from corner noise alone; what the model cannot express is not in it.
+    `covariance` (k, k) is that of the intrinsics; see :func:`projection_slopes`. It is the
+    error from corner noise alone; what the model cannot express is not in it.
     """
     j = projection_slopes(camera, support, rays)
     return np.asarray(j @ covariance @ np.swapaxes(j, -1, -2), float)

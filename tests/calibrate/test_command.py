@@ -50,6 +50,8 @@ def test_lens(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert figures["views_used"] == 9
     assert figures["skipped"] == [str(files[-1])]
     assert figures["rms"] < 0.12
+    assert figures["verdict"].startswith("good to 0.3 px over")
+    assert set(figures["plots"]) >= {"verdict", "halves", "tilt", "worst", "uncertainty"}
     for (name, value), truth in zip(
         figures["intrinsics"].items(), CAMERA.intrinsics, strict=True
     ):

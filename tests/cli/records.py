@@ -22,6 +22,9 @@ FIGURES: dict[str, dict[str, Any]] = {
     },
     "hdr merge": {"clipped_pixels": 12, "dark_pixels": 0, "range_stops": 17.3},
     "calibrate lens": {
+        "verdict": "good to 0.3 px over 60 % of the picture",
+        "good": False,
+        "advice": ["take 2 views with the board at the left edge"],
         "rms_px": 0.183,
         "views": [{"file": f"board_{i}.jpg", "rms": 0.1 + i / 50} for i in range(9)],
         "plots": {"residuals": "residuals.png"},

@@ -124,6 +124,8 @@ def test_figures_have_units_and_long_ones_are_folded(recorded: Path) -> None:
     assert "rms0.183px" in text.replace(" ", "")
     assert "range17.3stops" in text.replace(" ", "")
     assert "views (9 rows)" in text
+    assert "✗ Good to 0.3 px over 60 % of the picture." in text
+    assert "Take 2 views with the board at the left edge." in text
     assert "noise\N{EN DASH}" in text.replace("noise ", "noise")
     assert found.tags.count("details") >= 16
 

@@ -85,6 +85,9 @@ class Section:
     command: str
     anchor: str
     note: str = ""
+    verdict: str = ""
+    good: bool = True
+    advice: tuple[str, ...] = ()
 
 
 def write_report(scene_file: Path, output: Path) -> str:
@@ -219,6 +222,9 @@ def _section(stage: StagePlan, run: Run | None, root: Path) -> Section:
         command=section.command,
         anchor=stage.name.replace(" ", "-"),
         note=f"{gone[0]} is recorded but not there any more" if gone else "",
+        verdict=section.verdict,
+        good=section.good,
+        advice=section.advice,
     )
 
 
@@ -227,7 +233,14 @@ def _empty(name: str) -> Section:
 
 
 def _section_of_run(run: Run, root: Path) -> Section:
-    figures = sort_figures(run.record.figures)
+    told = dict(run.record.figures)
+    # A calibration's verdict and advice stand above its figures.
+    verdict, good, advice = "", True, list[str]()
+    if run.record.stage.startswith("calibrate") and isinstance(told.get("verdict"), str):
+        verdict = str(told.pop("verdict"))
+        good = bool(told.pop("good", True))
+        advice = [str(line) for line in told.pop("advice", None) or []]
+    figures = sort_figures(told)
     return Section(
         name=run.record.stage,
         deed="",
@@ -237,6 +250,9 @@ def _section_of_run(run: Run, root: Path) -> Section:
         pictures=_pictures(run, figures, root),
         command=shlex.join(run.record.command),
         anchor="",
+        verdict=verdict,
+        good=good,
+        advice=tuple(advice),
     )
 
 
