@@ -27,7 +27,7 @@ def brightest(
     kernel = np.ones((3, 3), np.uint8)
     codes = cv2.dilate(fine, kernel)
     codes = np.asarray(cv2.resize(codes, (columns, rows), interpolation=cv2.INTER_NEAREST))
-    return codes if so_far is None else np.maximum(codes, so_far)
+    return np.asarray(codes if so_far is None else np.maximum(codes, so_far), np.uint8)
 
 
 def lit_places(codes: NDArray[np.uint8]) -> NDArray[np.bool_]:
@@ -47,4 +47,4 @@ def lit_places(codes: NDArray[np.uint8]) -> NDArray[np.bool_]:
 def spread_out(files: Sequence[str], most: int = PICTURES) -> list[str]:
     """At most so many of the files, evenly."""
     chosen = np.unique(np.linspace(0, len(files) - 1, most).round().astype(int))
-    return [files[i] for i in chosen]
+    return [files[int(i)] for i in chosen]

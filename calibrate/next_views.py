@@ -151,9 +151,9 @@ def near_corners(
 ) -> NDArray[np.bool_]:
     """Which of the `pixels` (n, 2) lie near `corners` (N, 2), or inside their `hull`."""
     import cv2
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
-    distance, _ = cKDTree(corners).query(pixels)
+    distance, _ = KDTree(corners).query(pixels)
     near = np.asarray(distance < REACH * max(size), bool)
     if hull is not None:
         inside = [cv2.pointPolygonTest(hull, (x, y), False) >= 0 for x, y in pixels.tolist()]
@@ -290,14 +290,14 @@ def _candidate(
     lit: NDArray[np.bool_] | None,
 ) -> View | None:
     """The board at a share `at` of the picture, as near to it as it is whole."""
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     camera = known.estimate.camera
     board = target.points().reshape(-1, 3)
     middle = (np.array(camera.size) - 1) / 2
     wanted = np.array(at) * camera.size
     margin = 0.01 * max(camera.size)
-    dark = None if lit is None else cKDTree(known.pixels)
+    dark = None if lit is None else KDTree(known.pixels)
     for pull in np.linspace(1, 0, 9):
         ray = camera.unproject(middle + pull * (wanted - middle))
         if not np.isfinite(ray).all():
@@ -306,7 +306,8 @@ def _candidate(
         if pose is None:
             continue
         seen = camera.project(pose.apply(board))
-        inside = (seen >= margin).all() and (seen <= np.array(camera.size) - 1 - margin).all()
+        far = np.array(camera.size) - 1 - margin
+        inside = bool((seen >= margin).all() and (seen <= far).all())
         if inside and lit is not None and dark is not None:
             inside = bool(lit[dark.query(seen)[1]].all())
         if inside:

@@ -85,7 +85,7 @@ def plot_tilt(lens: Lens, path: str | os.PathLike[str]) -> None:
         axes.add_patch(Circle((0, 0), ring, fill=False, ls=":", lw=0.8, color="0.5"))
         axes.annotate(f"{ring}°", (0, ring), fontsize=8, color="0.4")
     colours = mpl.colormaps["turbo"](np.linspace(0.05, 0.95, len(slant)))
-    axes.scatter(*slant.T, s=28, c=colours, edgecolor="black", linewidth=0.4)
+    axes.scatter(slant[:, 0], slant[:, 1], s=28, c=colours, edgecolor="black", linewidth=0.4)
     axes.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
     axes.set_xlabel("right edge nearer, degrees", fontsize=9)
     axes.set_ylabel("top edge nearer, degrees", fontsize=9)
@@ -150,7 +150,7 @@ def plot_worst(
     high = 0.7 + 3.5 * min(height / width, 1.4)
     figure = Figure(figsize=(3.6 * max(len(order), 2), high), layout="constrained")
     for axes, view in zip(np.atleast_1d(figure.subplots(1, len(order))), order, strict=True):
-        picture = grey(read_image(files[view]))
+        picture = grey(read_image(files[int(view)]))
         step = max(1, max(picture.shape) // 900)
         extent = (-0.5, width - 0.5, height - 0.5, -0.5)
         axes.imshow(picture[::step, ::step], cmap="gray", vmin=0, vmax=255, extent=extent)
@@ -165,7 +165,7 @@ def plot_worst(
         axes.plot(*lens.observed[view][lens.outliers[view]].T, "x", color="crimson", ms=5)
         axes.set(xlim=extent[:2], ylim=extent[2:], xticks=[], yticks=[])
         fit = f"{rms:.2f} px RMS" if good.any() else "fits no pose"
-        axes.set_title(f"{Path(files[view]).name}\n{fit}, {lost} rejected", fontsize=9)
+        axes.set_title(f"{Path(files[int(view)]).name}\n{fit}, {lost} rejected", fontsize=9)
     _save(figure, path)
 
 
