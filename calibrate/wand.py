@@ -16,8 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chromeball.calibrate.wand_adjust import Bundle, Sightings
-from chromeball.calibrate.wand_check import check_tracks, judge
-from chromeball.calibrate.wand_lens import MODELS, candidates, known, refinable, unknown
+from chromeball.calibrate.wand_check import check_tracks, judge, lens_errors
+from chromeball.calibrate.wand_lens import (
+    MODELS,
+    candidates,
+    known,
+    learned,
+    refinable,
+    unknown,
+)
 from chromeball.calibrate.wand_result import Tracks, WandRig
 from chromeball.calibrate.wand_stages import Stages, at_delays, rays_of, spread
 from chromeball.calibrate.wand_start import Start, ordered, place
@@ -85,6 +92,7 @@ def solve_wand(
     reference, second = (0, 1) if distance is None else distance[:2]
     gauge = (reference, None if lengths else second)
     misses: tuple[float, ...] = MISSES
+    blind = cameras is None
     if cameras is None:
         cameras = _search(tracks, model, lengths)
         free = unknown(cameras)
@@ -100,6 +108,10 @@ def solve_wand(
     if not free.free:
         _check_given(stages, bundle, tracks)
     bundle, used = stages.settle(bundle)
+    if blind:
+        errors = lens_errors(stages, bundle, used)
+        stages = replace(stages, lenses=learned(free, bundle.cameras, errors))
+        bundle, used = stages.settle(bundle)
     delays = np.zeros(len(cameras), bool)
     if not synchronous:
         bundle, used, stages, delays = _delayed(bundle, used, stages, pixels)

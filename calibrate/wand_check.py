@@ -113,6 +113,16 @@ def judge(
     )
 
 
+def lens_errors(
+    stages: Stages, bundle: Bundle, used: NDArray[np.bool_]
+) -> tuple[NDArray[np.float64], ...]:
+    """Standard errors of each camera's intrinsics, (k,)."""
+    sigma = stages.sigma(bundle, used)
+    freedom = stages.freedom(sigma, 3)
+    spread, _ = _spread(stages, bundle, used, freedom)
+    return _by_camera(bundle, freedom, sigma**2 * spread)[1]
+
+
 def _spread(
     stages: Stages,
     bundle: Bundle,

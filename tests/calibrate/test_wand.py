@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from chromeball.calibrate.virtual_wand import path, room, watch
 from chromeball.calibrate.wand import solve_wand
 from chromeball.calibrate.wand_files import read_lens, read_points
+from chromeball.calibrate.wand_lens import candidate, learned, unknown
 from chromeball.calibrate.wand_result import Tracks, WandRig
 from chromeball.calibrate.wand_world import as_surveyed, on_floor, upright
 from chromeball.scene.camera import CameraModel
@@ -83,6 +84,24 @@ def test_wand_gives_scale_and_lenses() -> None:
         off = np.abs(found.intrinsics - camera.intrinsics)
         assert (off < 4.5 * errors + 1e-9).all()
         assert errors[0] < 1.0
+
+
+def test_principal_points_teach_each_other() -> None:
+    """Offsets no larger than their errors hold the centres in the middle; large ones do not."""
+    cameras = tuple(candidate("opencv4", (1000, 800), 1.0) for _ in range(6))
+    start = unknown(cameras)
+    errors = tuple(np.full(8, 2.0) for _ in cameras)
+    before = start.precision[0][2]
+    for offset, least, most in ((1.0, 0.5, 1.3), (12.0, 10.0, 13.0)):
+        sign = np.array([0, 0, 1.0, -1, 0, 0, 0, 0])
+        moved = tuple(
+            replace(c, intrinsics=c.intrinsics + (-1) ** i * offset * sign)
+            for i, c in enumerate(cameras)
+        )
+        after = learned(start, moved, errors).precision[0]
+        assert after[2] > before
+        assert least < after[2] ** -0.5 < most
+        assert after[4] == start.precision[0][4]
 
 
 def test_three_lights_know_their_ends() -> None:
