@@ -34,8 +34,12 @@ from chromeball.scene.errors import UserError
 from chromeball.scene.pose import Pose
 
 TITLE = "Blender"
-#: Every lens is written, as near as Cycles comes to it.
-MODELS: tuple[str, ...] | None = None
+#: Models that are written as near as Cycles comes to them; they have an axis.
+MODELS = (
+    "pinhole",
+    *(f"LENSMODEL_OPENCV{n}" for n in (4, 5, 8, 12)),
+    *("kb4", "kb4_decentred", "equidistant", "equisolid", "stereographic", "orthographic"),
+)
 #: Width of the sensor, mm.
 SENSOR = 36.0
 #: Blender's world has +Z up: its x is ours, its y our -z, its z our y.

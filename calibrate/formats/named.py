@@ -25,8 +25,8 @@ class Loss:
     """What a change of lens model cost.
 
     ``was`` and ``now`` name the models; ``rms`` and ``worst`` are distances in pixels over the
-    picture; ``left_out`` is the share of the picture whose directions the new model does not
-    reach.
+    picture, or over its ``part``; ``left_out`` is the share of it whose directions the new
+    model does not reach. The camera is ``turned`` by so many radians, its pose with it.
     """
 
     was: str
@@ -34,6 +34,8 @@ class Loss:
     rms: float
     worst: float
     left_out: float = 0.0
+    part: str = "the picture"
+    turned: float = 0.0
 
 
 @dataclass(frozen=True)

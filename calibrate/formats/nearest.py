@@ -5,14 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from chromeball.calibrate.adjust import gradients
 from chromeball.calibrate.convert import converted, is_flat
 from chromeball.calibrate.formats.named import Loss, fisheye
 from chromeball.scene.camera import CameraModel
 from chromeball.scene.errors import UserError
+from chromeball.scene.pose import Pose
 
 #: Each of a family is the next with its last terms zero.
 _FAMILIES = (
@@ -58,13 +61,26 @@ def nearest(camera: CameraModel, models: Sequence[str]) -> tuple[CameraModel, Lo
             f"a panorama ({camera.model}) is not a lens: this format has no such camera"
         )
     pixels, rays = directions(camera)
+    part, free = "the picture", camera.model.startswith("LENSMODEL_SPLINED")
+    if free and camera.region is not None:  # elsewhere its splines are what they began as
+        part, inside = "its calibrated part", _inside(pixels, camera.region)
+        pixels, rays = pixels[inside], rays[inside]
     fits: list[tuple[CameraModel, Loss]] = []
     for model in _richest(models):
         found, _ = converted(camera, model, rays)
+        turn = Pose.identity()
+        if free:
+            found, turn = _turned(found, rays, pixels)
         if model.startswith("kb4"):
-            found = fisheye(found.intrinsics, found.size, found.world_from_camera)
-        found = replace(found, region=camera.region)
-        fits.append((found, loss(found, camera.model, pixels, rays)))
+            found = fisheye(found.intrinsics, found.size)
+        found = replace(
+            found,
+            region=camera.region,
+            world_from_camera=camera.world_from_camera @ turn.inverse(),
+        )
+        cost = loss(found, camera.model, pixels, turn.rotate(rays))
+        angle = float(np.linalg.norm(turn.rotation_vector()))
+        fits.append((found, replace(cost, part=part, turned=angle)))
     if not fits:
         raise UserError(f"this format has no lens like {camera.model}")
     return min(fits, key=lambda fit: (round(fit[1].left_out, 3), fit[1].rms))
@@ -76,6 +92,55 @@ def _richest(models: Sequence[str]) -> list[str]:
     for family in _FAMILIES:
         found += [model for model in family if model in models][-1:]
     return found
+
+
+def _turned(
+    camera: CameraModel, rays: NDArray[np.float64], pixels: NDArray[np.float64]
+) -> tuple[CameraModel, Pose]:
+    """The lens and the turn that see `rays` (N, 3), turned, nearest to `pixels` (N, 2).
+
+    A splined lens has no axis: it may have been solved turned by degrees against its pose, also
+    about itself, which no other model can follow. `camera` is the start.
+    """
+    from scipy.optimize import least_squares
+
+    if is_flat(camera.model):
+        ahead = rays[:, 2] > GRAZING
+        rays, pixels = rays[ahead], pixels[ahead]
+    count, turn = len(camera.intrinsics), Pose.identity()
+
+    def seen(x: NDArray[np.float64]) -> tuple[CameraModel, NDArray[np.float64]]:
+        step = Pose.from_rotation_vector(x[count:], np.zeros(3))
+        return replace(camera, intrinsics=x[:count]), (step @ turn).rotate(rays)
+
+    def miss(x: NDArray[np.float64]) -> NDArray[np.float64]:
+        lens, points = seen(x)
+        return np.nan_to_num((gradients(lens, points)[0] - pixels).ravel(), nan=1e6)
+
+    def slope(x: NDArray[np.float64]) -> NDArray[np.float64]:
+        lens, points = seen(x)
+        _, by_point, by_intrinsics = gradients(lens, points)
+        by_turn = np.cross(points[:, None], by_point)  # at no turn
+        return np.nan_to_num(
+            np.concatenate([by_intrinsics, by_turn], -1).reshape(-1, count + 3)
+        )
+
+    solve: Any = least_squares
+    for _ in range(2):
+        start = np.concatenate([camera.intrinsics, np.zeros(3)])
+        x = solve(miss, start, slope, x_scale="jac", ftol=1e-6, max_nfev=60).x
+        turn = Pose.from_rotation_vector(x[count:], np.zeros(3)) @ turn
+        camera = replace(camera, intrinsics=x[:count])
+    return camera, turn
+
+
+def _inside(
+    pixels: NDArray[np.float64], region: NDArray[np.floating[Any]]
+) -> NDArray[np.bool_]:
+    """Which of `pixels` (N, 2) lie in the polygon `region` (M, 2)."""
+    from matplotlib.path import Path as Polygon
+
+    return np.asarray(Polygon(np.asarray(region, float)).contains_points(pixels), bool)
 
 
 def directions(camera: CameraModel) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -107,9 +107,11 @@ def write_as(
                 temporary.write_bytes(data)
     for name, loss in found.losses:
         off = (
-            f"{name}: {loss.was} as {loss.now}, off by {loss.rms:.2g} px (RMS over the picture"
+            f"{name}: {loss.was} as {loss.now}, off by {loss.rms:.2g} px (RMS over {loss.part}"
         )
         out = f", without {loss.left_out:.1%} of it" if loss.left_out > 0 else ""
+        turn = f", turned by {math.degrees(loss.turned):.3g} degrees with its pose"
+        out += turn if loss.turned else ""
         warning = "warning: " if loss.worst > _FAR or loss.left_out > 0 else ""
         say(f"{warning}{off}{out}; at most {loss.worst:.2g})")
     for line in found.left_behind:
