@@ -24,6 +24,7 @@ from chromeball.envmap.stitch.frames import Frame
 from chromeball.hdr.prior import known_cameras
 from chromeball.scene.camera import CameraModel
 from chromeball.scene.color import srgb_decode
+from chromeball.scene.vignette import Edge, Vignette, log_slopes, polynomial
 
 type Array = NDArray[np.float64]
 
@@ -49,7 +50,8 @@ class Photometric:
     """``exposure`` (N, 3): ln of what each frame is brighter than the panorama, per channel.
 
     ``falloff`` (TERMS,): c1, c2, ... of 1 + c1 r^2 + c2 r^4 + ..., as `envmap probe` takes it.
-    ``exposure_sigma`` (N,) and ``falloff_sigma`` are standard errors; ``curve`` (255,): ln of
+    ``exposure_sigma`` (N,) are standard errors, ``falloff_covariance`` (TERMS, TERMS), and
+    ``covered`` the r that the overlaps reach; ``curve`` (255,): ln of
     the camera's response over sRGB at LEVELS, zeros where the response is known; ``scatter``
     the robust relative scatter of overlaps before and after; ``left`` (N,): median by which
     each frame still differs from its neighbours, relative; ``samples`` how many comparisons;
@@ -59,12 +61,27 @@ class Photometric:
     exposure: Array
     falloff: Array
     exposure_sigma: Array
-    falloff_sigma: Array
+    falloff_covariance: Array
     curve: Array
     scatter: tuple[float, float]
     left: Array
     samples: int
     applied: bool
+    covered: float = 1.0
+
+    @property
+    def falloff_sigma(self) -> Array:
+        """Standard errors of the fall-off, (TERMS,)."""
+        return np.sqrt(np.maximum(np.diag(self.falloff_covariance), 0))
+
+    def vignette(self, camera: CameraModel) -> Vignette:
+        """The fall-off of the lens, for pictures of other sessions."""
+        centre, reach, circle = optics(camera)
+        known = Vignette.of(
+            self.falloff.tolist(), camera.size, centre, reach, self.falloff_covariance
+        )
+        edge = Edge(centre, reach) if circle else None
+        return replace(known, covered=self.covered, edge=edge, source="overlap")
 
     def corrected(self, frame: Frame, index: int, camera: CameraModel) -> Frame:
         """Frame number `index` with its light on the panorama's scale."""
@@ -73,7 +90,7 @@ class Photometric:
         width, height = camera.size
         x, y = np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float))
         r2 = radius2(camera, np.stack([x, y], axis=-1))
-        fall = _falloff(r2, self.falloff)[0]
+        fall = polynomial(r2, self.falloff)
         gain = (np.exp(-self.exposure[index]) / fall[..., None]).astype(np.float32)
         if frame.assumed and self.curve.any():
             level = np.log(np.maximum(frame.radiance * frame.gathered, 1e-9))
@@ -89,7 +106,7 @@ def unchanged(count: int) -> Photometric:
         exposure=np.zeros((count, 3)),
         falloff=terms,
         exposure_sigma=frames,
-        falloff_sigma=terms,
+        falloff_covariance=np.zeros((TERMS, TERMS)),
         curve=np.zeros(len(LEVELS)),
         scatter=(0.0, 0.0),
         left=frames,
@@ -98,15 +115,20 @@ def unchanged(count: int) -> Photometric:
     )
 
 
-def radius2(camera: CameraModel, pixels: Array) -> Array:
-    """r^2 of `pixels` (..., 2), 1 at the corner of the picture or the rim of its circle."""
+def optics(camera: CameraModel) -> tuple[tuple[float, float], float, bool]:
+    """Where r is 0, the pixels to where it is 1, and whether that is the rim of a circle."""
     mapping = of_camera(camera)
     width, height = camera.size
-    middle = np.array([(width - 1) / 2, (height - 1) / 2])
-    reach = np.hypot(width, height) / 2
+    reach = math.hypot(width, height) / 2
     if isinstance(mapping, Radial):
-        middle = np.array(mapping.centre)
-        reach = min(reach, abs(mapping.focal[0]) * mapping.rim)
+        rim = abs(mapping.focal[0]) * mapping.rim
+        return mapping.centre, min(reach, rim), rim < reach
+    return ((width - 1) / 2, (height - 1) / 2), reach, False
+
+
+def radius2(camera: CameraModel, pixels: Array) -> Array:
+    """r^2 of `pixels` (..., 2), 1 at the corner of the picture or the rim of its circle."""
+    middle, reach, _ = optics(camera)
     return np.minimum((((pixels - middle) / reach) ** 2).sum(axis=-1), 1.0)
 
 
@@ -176,7 +198,7 @@ def solve(
     def model(x: Array) -> tuple[Array, Array]:
         """Differences that unknowns explain, and their slopes by the c_k and h_k."""
         c, h = np.split(x[count:], [TERMS])
-        (va, sa), (vb, sb) = _falloff(ra, c), _falloff(rb, c)
+        (va, sa), (vb, sb) = log_slopes(ra, c), log_slopes(rb, c)
         said = x[a] - x[b] + np.log(va / vb) - bent @ h
         return said, np.concatenate([sa - sb, -bent], axis=1)
 
@@ -231,12 +253,13 @@ def solve(
         exposure=channels if told else np.zeros((count, 3)),
         falloff=fall if told else np.zeros(TERMS),
         exposure_sigma=error[:count],
-        falloff_sigma=error[count : count + TERMS],
+        falloff_covariance=covariance[count : count + TERMS, count : count + TERMS],
         curve=h @ phi if told else np.zeros(len(LEVELS)),
         scatter=(before, 1.4826 * float(np.median(np.abs(fitted)))),
         left=_left(fitted if told else y, a, b, count),
         samples=len(p),
         applied=told,
+        covered=float(np.sqrt(np.quantile(np.concatenate([ra, rb]), 0.99))),
     )
 
 
@@ -261,7 +284,7 @@ def _possible(shared: Array, phi: Array) -> bool:
     """Whether the fall-off is positive and the response rises."""
     c, h = np.split(shared, [TERMS])
     rises = bool((np.diff(LEVELS + h @ phi) > 0).all())
-    return rises and float(_falloff(np.linspace(0, 1, 65), c)[0].min()) >= 0.02
+    return rises and float(polynomial(np.linspace(0, 1, 65), c).min()) >= 0.02
 
 
 def _left(differences: Array, a: NDArray[np.intp], b: NDArray[np.intp], count: int) -> Array:
@@ -270,13 +293,6 @@ def _left(differences: Array, a: NDArray[np.intp], b: NDArray[np.intp], count: i
     return np.array(
         [np.median(size[both == k]) if (both == k).any() else 0.0 for k in range(count)]
     )
-
-
-def _falloff(r2: Array, c: Array) -> tuple[Array, Array]:
-    """1 + c1 r^2 + c2 r^4 + ..., and the slopes of its logarithm by the c_k, (..., TERMS)."""
-    powers = np.stack([r2 ** (k + 1) for k in range(TERMS)], axis=-1)
-    value = 1 + powers @ c
-    return value, powers / value[..., None]
 
 
 def _tells(values: Array, covariance: Array) -> bool:

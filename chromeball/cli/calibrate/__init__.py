@@ -1,4 +1,4 @@
-"""``chromeball calibrate``: lenses, poses, undistorted pictures."""
+"""``chromeball calibrate``: lenses and their fall-off, poses, undistorted pictures."""
 
 from cyclopts import App
 
@@ -12,6 +12,7 @@ from chromeball.cli.calibrate.rig import rig
 from chromeball.cli.calibrate.track import track
 from chromeball.cli.calibrate.tracker import tracker
 from chromeball.cli.calibrate.undistort import undistort
+from chromeball.cli.calibrate.vignette import app as vignette
 from chromeball.cli.calibrate.wand import wand
 
 app = App(name="calibrate", help="Cameras and their poses.")
@@ -29,3 +30,4 @@ for _command in (
     wand,
 ):
     app.command(_command)
+app.command(vignette)

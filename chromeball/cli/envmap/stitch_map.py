@@ -81,12 +81,12 @@ def make_map(
         check_panorama_width(width)
     check_output(output, [*files, *inputs], ".exr")
     with Stage("envmap stitch", [*files, *inputs], width=width, exposure=exposure) as stage:
-        frames = _read(files, response)
+        frames = read_frames(files, response)
         features = []
         for frame in frames:
             _say(f"features of {frame.name}")
             features.append(find(frame.radiance, frame.valid))
-        model, freedom, lens_notes = _lens(camera, lens, refine, frames, features)
+        model, freedom, lens_notes = lens_of(camera, lens, refine, frames, features)
         found = orient(
             features, model, freedom=freedom, prior=prior, names=names, progress=_say
         )
@@ -186,7 +186,8 @@ def make_map(
     print_figures(stage.figures, as_json, output)
 
 
-def _read(files: Sequence[Path], response: Path | None) -> list[Frame]:
+def read_frames(files: Sequence[Path], response: Path | None) -> list[Frame]:
+    """The frames as radiance, all of one kind."""
     from chromeball.envmap.stitch.frames import check_alike, read_frame
 
     curve = None
@@ -213,13 +214,14 @@ def _read(files: Sequence[Path], response: Path | None) -> list[Frame]:
     return frames
 
 
-def _lens(
+def lens_of(
     camera: Path | None,
     lens: str | None,
     refine: Refine | None,
     frames: Sequence[Frame],
     features: Sequence[Features],
 ) -> tuple[CameraModel, Freedom, list[str]]:
+    """The lens to start from, what of it is solved along, and notes."""
     from chromeball.envmap.stitch.lens import Freedom, parse_lens
     from chromeball.envmap.stitch.links import likeliest
 
