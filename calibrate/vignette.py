@@ -9,9 +9,9 @@ a_g its light and exposure, u_g how its light varies over the board, w a light t
 share (a flat field's gradient, turned with the pictures). The u_g are random with variances
 that the pictures tell themselves (restricted maximum likelihood by EM; Laird and Ware 1982):
 the gradient of a lamp on a small board looks like a fall-off, and only many boards tell them
-apart. The c_k and the centre are solved by Gauss-Newton, outliers are left out, and a term stays
-only if it is two standard errors large. m, bilinear on a lattice, is added if the residuals
-ask for it.
+apart. The c_k and the centre are solved by Gauss-Newton, outliers are left out, and a term
+stays only if it is two standard errors large. m, bilinear on a lattice, is added if the
+residuals ask for it.
 """
 
 from __future__ import annotations
@@ -124,6 +124,7 @@ class _Fit:
     inflation: float
     condition: float
     chi_square: float
+    map_freedom: float
 
 
 def solve(
@@ -183,30 +184,36 @@ def solve(
     plain, gain = fit, 0.0
     mapped = False
     if with_map is not False:
-        tried = problem.fit(count, keep, fit, mapped=True)
-        freedom = LATTICE[0] * LATTICE[1]
-        # chi-square per cluster-inflated unit: what errs together must not ask for a map
-        drop = (fit.chi_square - tried.chi_square) / fit.inflation**2
-        gain = (drop - freedom) / math.sqrt(2 * freedom)
-        values = tried.x[-freedom:]
+        flat, tried = (
+            problem.fit(count, keep, plain, mapped=m, fixed=True) for m in (False, True)
+        )
+        # what errs together must not ask for a map
+        drop = (flat.chi_square - tried.chi_square) / plain.inflation**2
+        gain = (drop - tried.map_freedom) / math.sqrt(2 * max(tried.map_freedom, 1.0))
+        values = tried.x[-LATTICE[0] * LATTICE[1] :]
         mapped = bool(with_map) or (gain > ASKED and float(np.std(values)) > WORTH)
-        fit = tried if mapped else plain
+        if mapped:
+            fit = problem.fit(count, keep, plain, mapped=True)
     found = problem.vignette(fit, count, mapped, source, edge, covered)
     worst = _error_at_reach(found, samples.pixels)
     if not worst < WORST:
+        uneven = float(np.sqrt(fit.variances.max())) if fit.variances.size else 0.0
         raise UserError(
-            f"the pictures leave the fall-off open to {worst:.0%} where they reach: take more, "
-            "the board large and near the corners"
+            f"the pictures leave the fall-off open to {worst:.0%} where they reach, for the "
+            f"light varies by {uneven:.0%} within them: take more, under even light, what is "
+            "bright large and near the corners"
         )
     after = np.where(keep, fit.residuals, np.nan)
     bare = problem.fit(0, keep, plain)
-    spread = [1.4826 * float(np.nanmedian(np.abs(r[keep]))) for r in (bare.residuals, after)]
+    before, left = (
+        1.4826 * float(np.nanmedian(np.abs(r[keep]))) for r in (bare.residuals, after)
+    )
     shared = samples.shared.shape[1]
     start = count + 2 * free_centre
     return Solved(
         found,
         after,
-        (spread[0], spread[1]),
+        (before, left),
         tuple(float(v) for v in np.sqrt(fit.variances)),
         fit.x[start : start + shared],
         fit.inflation,
@@ -237,8 +244,9 @@ class _Problem:
         start: _Fit | None = None,
         *,
         mapped: bool = False,
+        fixed: bool = False,
     ) -> _Fit:
-        """Gauss-Newton on the fall-off, EM on the variances of the light."""
+        """Gauss-Newton on the fall-off, EM on the variances, unless these are `fixed`."""
         s = self.samples
         groups, L = int(s.group.max()) + 1, s.light.shape[1]
         nodes = _bilinear(s.pixels, self.size) if mapped else np.zeros((len(s.log), 0))
@@ -288,24 +296,27 @@ class _Problem:
             spread = inverse + through @ covariance @ np.swapaxes(through, 1, 2)
             second = u[:, 1:] ** 2 + np.diagonal(spread, axis1=1, axis2=2)[:, 1:]
             new = np.array([second[:, kinds == k].mean() for k in range(len(variances))])
+            new = variances if fixed else np.maximum(new, 1e-8)  # ln 1e-4 is even light
             used = float((w * residual**2).sum())
             # effective unknowns: trace of the hat matrix
             hat = columns - float(np.trace(covariance @ prior)) + groups
             shrunk = np.diagonal(spread, axis1=1, axis2=2)[:, 1:] * D[1:]
             hat += float((1 - shrunk).sum())
             freedom = max(float(keep.sum()) - hat, 1.0)
-            ratio = used / freedom
+            ratio = 1.0 if fixed else used / freedom
             calm = float(np.abs(delta[:count]).max()) < 1e-7 if count else True
             calm = calm and abs(ratio - 1) < 1e-3
             if len(new):
                 calm = calm and bool(np.abs(np.log(new / variances)).max() < 0.02)
             scale *= math.sqrt(ratio)
-            variances = np.maximum(new, 1e-10)
+            variances = new
             if calm and step > 2:
                 break
         inflation = self._inflation(J, local, through, covariance, residual, w, head)
         condition = float(np.linalg.cond(scaled)) if columns else 1.0
-        prior_cost = float((u[:, 1:] ** 2 * D[1:]).sum())
+        prior_cost = float((u[:, 1:] ** 2 * D[1:]).sum() + x @ prior @ x)
+        told = np.eye(columns) - covariance @ prior
+        freedom = float(np.trace(told[columns - nodes.shape[1] :, columns - nodes.shape[1] :]))
         return _Fit(
             x,
             covariance * inflation**2,
@@ -315,6 +326,7 @@ class _Problem:
             inflation,
             condition,
             used + prior_cost,
+            freedom,
         )
 
     def vignette(
@@ -360,7 +372,7 @@ class _Problem:
         return value + J[:, rest:] @ x[rest:], J
 
     def _slopes(self, pixels: Float, x: Float, count: int) -> tuple[Float, Float]:
-        """ln V of the polynomial, and its slopes by coefficients and centre."""
+        """Ln V of the polynomial, and its slopes by coefficients and centre."""
         if not count:
             return np.zeros(len(pixels)), np.zeros((len(pixels), 0))
         place = (pixels - self.middle) / self.reach

@@ -32,9 +32,7 @@ def plot_vignette(
     bins = np.linspace(0, float(r.max()), 41)
     number = np.clip(np.digitize(r, bins) - 1, 0, 39).ravel()
     count = np.maximum(np.bincount(number, minlength=40), 1)
-    mean, error = (
-        np.bincount(number, v.ravel(), minlength=40) / count for v in (V, V * sigma)
-    )
+    mean, error = (np.bincount(number, v.ravel(), minlength=40) / count for v in (V, V * sigma))
     middle = (bins[1:] + bins[:-1]) / 2
     if pixels is not None and residuals is not None:
         good = np.isfinite(residuals)

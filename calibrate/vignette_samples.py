@@ -30,7 +30,7 @@ BLOCKS, TILES = 96, 6
 #: that is left, and the way of it over the radius.
 SECTORS, SHOW, LEFT, WAY = 48, 5, 0.5, 0.04
 #: A gradient of one flat picture across the half diagonal, ln, that cannot be the lens's.
-GRADIENT = 0.03
+GRADIENT = 0.05
 
 
 @dataclass(frozen=True)
@@ -122,9 +122,7 @@ def _whiteness(target: Target) -> Float:
     return np.asarray(away, float)[np.ix_(rows, columns)].reshape(shape).transpose(0, 2, 1, 3)
 
 
-def _squares(
-    picture: Picture, grid: Float, white: Float, blur: float
-) -> tuple[Float, int]:
+def _squares(picture: Picture, grid: Float, white: Float, blur: float) -> tuple[Float, int]:
     """(n, 6) x, y, ln I, its error, place on the board; and how many are saturated."""
     a, b, c, d = grid[:-1, :-1], grid[:-1, 1:], grid[1:, :-1], grid[1:, 1:]
     t = (np.arange(STEPS) + 0.5) / STEPS
@@ -133,9 +131,7 @@ def _squares(
     q = (far[0] * (1 - u) + far[1] * u) * (1 - v) + (far[2] * (1 - u) + far[3] * u) * v
     sides = np.stack([np.linalg.norm(m, axis=-1) for m in (b - a, d - c, c - a, d - b)])
     short = np.nan_to_num(sides.min(axis=0))
-    area = np.nan_to_num(
-        np.abs(np.cross(_third(d - a), _third(c - b))[..., 2]) / 2 / STEPS**2
-    )
+    area = np.nan_to_num(np.abs(np.cross(_third(d - a), _third(c - b))[..., 2]) / 2 / STEPS**2)
     usable = white * short[..., None, None] > MARGIN + BLURS * blur
     count = usable.sum(axis=(2, 3))
     enough = (count >= FEWEST) & (count * area >= FEWEST_PIXELS)

@@ -20,6 +20,7 @@ from chromeball.envmap.resample import Warped, carry, warp
 from chromeball.scene.camera import WORLD_FROM_LATLONG
 from chromeball.scene.color import luminance
 from chromeball.scene.errors import UserError
+from chromeball.scene.vignette import LEAST, Vignette, polynomial
 
 type Array = NDArray[np.float64]
 
@@ -239,8 +240,10 @@ def rim_weight(source: Mapping, world: Array) -> NDArray[np.float32]:
     return (np.cos(np.minimum(way, 1) * math.pi / 2) ** 2 + _MIN_WEIGHT).astype(np.float32)
 
 
-def without_vignetting(shot: Shot, coefficients: Sequence[float]) -> Shot:
+def without_vignetting(shot: Shot, falloff: Vignette | Sequence[float]) -> Shot:
     """The shot divided by 1 + c1 r^2 + c2 r^4 + ..., r = 1 at the rim of its image circle.
+
+    A measured `falloff` has its own centre and radius.
 
     Raises
     ------
@@ -248,12 +251,12 @@ def without_vignetting(shot: Shot, coefficients: Sequence[float]) -> Shot:
         When the lens has no image circle or the fall-off is not positive inside it.
 
     """
-    gain = vignetting_gain(shot.mapping, coefficients).astype(np.float32)[..., None]
+    gain = vignetting_gain(shot.mapping, falloff).astype(np.float32)[..., None]
     sigma = None if shot.sigma is None else shot.sigma * gain
     return replace(shot, radiance=shot.radiance * gain, sigma=sigma)
 
 
-def vignetting_gain(mapping: Mapping, coefficients: Sequence[float]) -> Array:
+def vignetting_gain(mapping: Mapping, falloff: Vignette | Sequence[float]) -> Array:
     """1 / (1 + c1 r^2 + c2 r^4 + ...), (H, W), r = 1 at the rim of the image circle.
 
     Raises
@@ -262,16 +265,21 @@ def vignetting_gain(mapping: Mapping, coefficients: Sequence[float]) -> Array:
         When the lens has no image circle or the fall-off is not positive inside it.
 
     """
+    if isinstance(falloff, Vignette):
+        return 1 / falloff.picture(mapping.size).astype(float)
     if not isinstance(mapping, Radial):
-        raise UserError("vignetting is measured on an image circle; this lens has none")
-    polynomial = np.polynomial.Polynomial([1.0, *coefficients])
-    if not (polynomial(np.linspace(0, 1, 1001)) > 0.01).all():
+        raise UserError(
+            "vignetting c1,c2,... counts from the rim of an image circle, and this lens has "
+            "none; a vignette.json of `calibrate vignette` fits any lens"
+        )
+    coefficients = np.array(falloff, float)
+    if not (polynomial(np.linspace(0, 1, 1001), coefficients) > LEAST).all():
         raise UserError("the vignetting falls below 1 % inside the image circle: check c1, c2")
     width, height = mapping.size
     x = (np.arange(width) - mapping.centre[0]) / (mapping.focal[0] * mapping.rim)
     y = (np.arange(height) - mapping.centre[1]) / (mapping.focal[1] * mapping.rim)
     r2 = np.minimum(x[None, :] ** 2 + y[:, None] ** 2, 1.0)
-    return 1 / polynomial(r2)
+    return 1 / polynomial(r2, coefficients)
 
 
 def trimmed(shot: Shot, angle: float) -> Shot:

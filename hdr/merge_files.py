@@ -41,6 +41,7 @@ from chromeball.hdr.stream import Frames
 from chromeball.scene.errors import UserError
 from chromeball.scene.image import exr_rows
 from chromeball.scene.raw import Balance, Mosaic, develop, develop_sigma, tiled, touched
+from chromeball.scene.vignette import Vignette
 
 type Float = NDArray[np.float64]
 type Merge = Callable[[Sequence[NDArray[Any]], Float], Radiance]
@@ -418,6 +419,34 @@ def scaled(part: Radiance, factor: float) -> Radiance:
     )
 
 
+def without_vignetting(
+    parts: Iterable[tuple[int, Radiance]], falloff: Vignette, size: tuple[int, int]
+) -> Iterator[tuple[int, Radiance]]:
+    """Bands (first row, radiance) divided by a lens's fall-off; `size` is of the picture."""
+    for top, part in parts:
+        rows = (top, top + len(part.radiance))
+        gain = np.float32(1) / falloff.picture(size, rows)[..., None]
+        sigma = None if part.sigma is None else part.sigma * gain
+        yield top, replace(part, radiance=part.radiance * gain, sigma=sigma)
+
+
+def vignetting_strays(falloff: Vignette, bracket: Bracket, size: tuple[int, int]) -> float:
+    """By how much V differs, relatively, between where a pixel is and where frames saw it."""
+    known = falloff.size
+    scale = np.array([known[0] / size[0], known[1] / size[1]])
+    q = np.stack(
+        np.meshgrid(np.linspace(0, size[0] - 1, 9), np.linspace(0, size[1] - 1, 9)), axis=-1
+    ).reshape(-1, 2)
+    here = falloff.at((q + 0.5) * scale - 0.5)
+    worst = 0.0
+    for frame in bracket.frames:
+        if frame.transform is not None:
+            moved = np.concatenate([q, np.ones((len(q), 1))], axis=1) @ frame.transform.T
+            there = falloff.at((moved[:, :2] / moved[:, 2:] + 0.5) * scale - 0.5)
+            worst = max(worst, float(np.abs(np.log(there / here)).max()))
+    return worst
+
+
 def write_merged(
     path: Path,
     size: tuple[int, int],
@@ -558,10 +587,12 @@ def read_luminance(
     place: Sequence[int],
     luminance: float,
     whole: Radiance | None = None,
+    falloff: Vignette | None = None,
 ) -> Luminance:
     """Calibrate by a reading of `luminance` cd/m^2 at `place`, x, y or x, y, width, height.
 
     `whole` is the merged picture where it is at hand; else the rows of the place are merged.
+    `falloff` is divided out first.
     """
     height, width, _ = frames.shape
     x, y, across, down = place if len(place) == 4 else (place[0] - 3, place[1] - 3, 7, 7)
@@ -574,6 +605,8 @@ def read_luminance(
     if part is None:
         rows = frames.part(prepared.chosen, y, y + down)
         part, top = prepared.merge(rows, exposures[list(prepared.chosen)]), y
+    if falloff is not None:
+        _, part = next(without_vignetting([(top, part)], falloff, (width, height)))
     return luminance_scale(
         part.radiance, (x, y - top, across, down), luminance, clipped=part.clipped != 0
     )

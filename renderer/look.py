@@ -3,7 +3,8 @@
 What the camera did to the plate is in the plate, so only the synthetic part is changed. With
 B the plate, a composite is C = k B + S: k what is left of the plate (1 - alpha, or
 1 - alpha + Q - 1 on support), S what is synthetic. Softness blurs k - 1 and S, never B;
-vignetting falls on S, for k B has it; and noise is given to the amount that is missing,
+vignetting falls on S, for k B has it (on all of C where it was divided out of B); and noise is
+given to the amount that is missing,
 
     var = v(C) - k^2 v(B),
 
@@ -28,9 +29,10 @@ from chromeball.renderer.lens import Filter, edge
 from chromeball.renderer.sharpness import Softness, measure_softness, soften, softening
 from chromeball.scene.camera import CameraModel
 from chromeball.scene.errors import UserError
-from chromeball.scene.image import read_image
+from chromeball.scene.image import read_header, read_image
 from chromeball.scene.manifest import Look, Scene
 from chromeball.scene.record import Json, to_json
+from chromeball.scene.vignette import REMOVED, Vignette, read_vignette
 
 type Float = NDArray[np.float64]
 
@@ -53,7 +55,8 @@ class Exposed:
 class CameraLook:
     """What the camera does to a picture; None or ones where it is left out.
 
-    ``falloff`` (H, W) float32: vignetting, 1 at the centre. ``seed``: of the noise, 0 or more.
+    ``falloff`` (H, W) float32: vignetting, 1 at the centre; ``flattened``: the plate's own was
+    divided out, so that all gets it. ``seed``: of the noise, 0 or more.
     ``filter``: that the synthetic part was sampled with, so far its only softness.
     """
 
@@ -63,6 +66,7 @@ class CameraLook:
     exposed: Exposed | None = None
     seed: int = 0
     filter: Filter = "box"
+    flattened: bool = False
 
     def figures(self) -> dict[str, Json]:
         """What was measured on the plate, for the record."""
@@ -73,6 +77,7 @@ class CameraLook:
             found["softness"] = to_json(self.softness.figures())
         if self.falloff is not None:
             found["vignetting_least"] = float(self.falloff.min())
+            found["vignetting_of_plate"] = self.flattened
         if self.exposed is not None:
             found["frame"] = self.exposed.frame
         return found
@@ -113,8 +118,17 @@ def read_look(
         noise = measure_noise(plate, sigma=sigma, usable=usable)
     if look.softness:
         softness = measure_softness(plate)
+    flattened = False
     if look.vignetting:
-        falloff = fall_off(look.vignetting, camera)
+        given: Vignette | Sequence[float]
+        if isinstance(look.vignetting, str):
+            file = folder / look.vignetting
+            given = read_vignette(file)
+            inputs.append(file)
+        else:
+            given = look.vignetting
+        falloff = fall_off(given, camera)
+        flattened = plate_file is not None and REMOVED in read_header(plate_file).attributes
     if look.response is not None:
         if plate_file is None:
             raise UserError("look.response needs a plate: this view has none, leave it out")
@@ -126,7 +140,8 @@ def read_look(
             inputs.append(folder / scene.folder / "response.json")
         exposed = _exposed(look, read_response(inputs[-1]), plate_file, plate)
     seed = scene.render.seed % 2**64  # as the core takes it
-    found = CameraLook(noise, softness, falloff, exposed, seed, scene.render.filter)
+    kind = scene.render.filter
+    found = CameraLook(noise, softness, falloff, exposed, seed, kind, flattened)
     return found, tuple(inputs)
 
 
@@ -155,10 +170,10 @@ def _exposed(
     return Exposed(response, float(scale * exposures[frame]), frame, look.jpeg)
 
 
-def fall_off(coefficients: list[float], camera: CameraModel) -> NDArray[np.float32]:
+def fall_off(falloff: Vignette | Sequence[float], camera: CameraModel) -> NDArray[np.float32]:
     """V = 1 + c1 r^2 + c2 r^4 + ..., (H, W); r = 1 at half the picture's diagonal.
 
-    r is counted from the optical axis.
+    r is counted from the optical axis. A measured `falloff` has its own centre and radius.
 
     Raises
     ------
@@ -168,9 +183,11 @@ def fall_off(coefficients: list[float], camera: CameraModel) -> NDArray[np.float
     """
     if camera.model == "latlong":
         raise UserError("look.vignetting: a lat-long panorama has no lens")
+    if isinstance(falloff, Vignette):
+        return falloff.picture(camera.size)
     centre = camera.project(np.array([0.0, 0.0, 1.0]))
     r2 = ((camera.pixel_grid() - centre) ** 2).sum(axis=2) / (np.hypot(*camera.size) / 2) ** 2
-    V = np.polynomial.polynomial.polyval(r2, [1.0, *coefficients])
+    V = np.polynomial.polynomial.polyval(r2, [1.0, *falloff])
     if V.min() <= 0:
         raise UserError("look.vignetting falls to zero or below inside the picture")
     return V.astype(np.float32)
@@ -184,7 +201,7 @@ def apply_look(
     """The composite with softness, vignetting and noise, and figures of what was done.
 
     ``rgb`` and ``changed`` are new, the layers stay as rendered. Where nothing is synthetic the
-    plate's bits stay.
+    plate's bits stay, unless its fall-off was divided out and comes back.
     """
     k, synthetic = composite.kept, composite.added
     figures: dict[str, Json] = {}
@@ -192,7 +209,7 @@ def apply_look(
         seen = partial(edge, look.filter)
         kernels = [softening(float(width), seen) for width in look.softness.width]
         k, synthetic = 1 + _soften(k - 1, kernels), _soften(synthetic, kernels)
-    if look.falloff is not None:
+    if look.falloff is not None and not look.flattened:
         synthetic = synthetic * look.falloff[..., None]
     changed = (k != 1).any(axis=2) | (synthetic != 0).any(axis=2)
     blend = plate * k + synthetic
@@ -212,6 +229,8 @@ def apply_look(
         noisier = (missing < -0.1 * wanted).any(axis=2)
         figures["noisier_pixels"] = int(noisier[within].sum())
     rgb = np.where(changed[..., None], rgb, plate)
+    if look.falloff is not None and look.flattened:
+        rgb = rgb * look.falloff[..., None]
     return replace(composite, rgb=rgb, changed=changed, clipped=int(clipped.sum())), figures
 
 

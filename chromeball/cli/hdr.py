@@ -300,6 +300,13 @@ def merge(
         Path | None,
         Parameter(help="A map of the same session in cd/m^2: its scale serves this one too."),
     ] = None,
+    vignetting: Annotated[
+        str | None,
+        Parameter(
+            help="Fall-off of the lens, divided out: a vignette.json of `calibrate vignette`, "
+            "or c1,c2,... of 1 + c1 r^2 + c2 r^4 + ..., r = 1 at the picture's corner."
+        ),
+    ] = None,
     memory: Annotated[
         float, Parameter(help="Gigabytes of frames to keep in memory; others are read twice.")
     ] = 1.0,
@@ -321,6 +328,8 @@ def merge(
         read_luminance,
         scaled,
         suspicious,
+        vignetting_strays,
+        without_vignetting,
         write_merged,
     )
     from chromeball.hdr.plots import plot_radiance
@@ -328,11 +337,13 @@ def merge(
     from chromeball.hdr.stream import Frames
     from chromeball.scene.image import NEGATIVE_MEANING, write_picture
     from chromeball.scene.raw import no_bayer
+    from chromeball.scene.vignette import REMOVED, file_of, read_known, resolved
 
     if output.suffix.lower() != ".exr":
         raise UserError("a radiance map is written as .exr", file=output)
     if not 0 <= memory < 1e6:
         raise UserError(f"--memory {memory:g}: give gigabytes, 0 or more")
+    falloff = None if vignetting is None else read_known(vignetting)
     reading = _reading(luminance, grey_card, at, scale_from)
     bracket = read_bracket(inputs, parse_times(times), parse_stops(nd), exact=exact_times)
     _notes(bracket.notes)
@@ -382,6 +393,7 @@ def merge(
             inputs=[
                 *bracket.inputs,
                 *(path for path in (response, scale_from) if path is not None),
+                *file_of(vignetting),
             ],
             times=times,
             exact_times=exact_times,
@@ -395,6 +407,7 @@ def merge(
             luminance=luminance,
             grey_card=grey_card,
             at=at,
+            vignetting=vignetting,
         ) as stage,
         Frames(
             bracket,
@@ -463,9 +476,17 @@ def merge(
         attributes["radianceUnit"] = unit
         known_scale = None if scale_from is None else _scale_of(scale_from, bracket.scale, unit)
         factor = known_scale or 1.0
+        size = frames.shape[1], frames.shape[0]
+        fall = None
+        if falloff is not None:
+            fall = resolved(falloff, size)
+            attributes[REMOVED] = str(vignetting)
+            strays = vignetting_strays(fall, bracket, size)
+            stage.figures |= {"vignetting_strays": strays, "vignetting_beyond": fall.beyond()}
+            _vignetting_notes(fall, strays, bracket)
         if reading is not None:
             place, cd = reading
-            meter = read_luminance(frames, exposures, prepared, place, cd, whole)
+            meter = read_luminance(frames, exposures, prepared, place, cd, whole, fall)
             factor = meter.scale
             stage.figures |= {"luminance_error": meter.error, "metered_pixels": meter.pixels}
         if reading is not None or known_scale is not None:
@@ -474,7 +495,8 @@ def merge(
         parts = (
             merge_bands(frames, exposures, prepared) if whole is None else iter([(0, whole)])
         )
-        size = frames.shape[1], frames.shape[0]
+        if fall is not None:
+            parts = without_vignetting(parts, fall, size)
         with stage.output(output) as temporary:
             figures, glance = write_merged(
                 temporary,
@@ -575,6 +597,21 @@ def _reading(
         return place, luminance
     assert card is not None
     return place, grey_card(*card)
+
+
+def _vignetting_notes(fall: Any, strays: float, bracket: Any) -> None:
+    """Say where a fall-off does not fit the pictures."""
+    apertures = {frame.aperture for frame in bracket.frames if frame.aperture}
+    if fall.aperture is not None and any(abs(a / fall.aperture - 1) > 0.05 for a in apertures):
+        listed = ", ".join(f"f/{a:g}" for a in sorted(apertures))
+        _tell(f"the fall-off was measured at f/{fall.aperture:g}, the pictures have {listed}")
+    if strays > 0.005:
+        _tell(f"the frames moved: the fall-off fits them to {strays:.1%} only")
+    if fall.beyond() > 0.05:
+        _tell(
+            f"{fall.beyond():.0%} of the picture lies farther out than where the fall-off was "
+            "measured"
+        )
 
 
 def _same_camera(curve: Any, bracket: Any) -> None:

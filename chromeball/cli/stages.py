@@ -30,6 +30,7 @@ from chromeball.scene.manifest import (
     View,
 )
 from chromeball.scene.sequence import at, frames_of, moves
+from chromeball.scene.vignette import file_of
 
 # the suffixes of `chromeball.scene.image`, which is too heavy to import for a plan
 RAW_SUFFIXES = frozenset(
@@ -430,6 +431,9 @@ class _Planner:
             options.append("--deghost")
         if any(view.look.noise and view.bracket == bracket.name for view in self.rendered):
             options.append("--sigma")
+        if bracket.vignetting:
+            options += _option("vignetting", bracket.vignetting)
+            inputs += map(str, file_of(bracket.vignetting))
         hdr = self.scene.hdr
         if hdr.snr:
             options += _option("snr", f"{hdr.snr:.10g}")
@@ -564,8 +568,7 @@ class _Planner:
             options += _option("ball", " ".join(_numbers(ball) for ball in balls))
             options += _option("photographer", f"{probe.photographer:.10g}")
             options += _option("reflectance", _numbers(probe.reflectance))
-        if probe.vignetting:
-            options += _option("vignetting", ",".join(repr(c) for c in probe.vignetting))
+        options += _vignetting(probe, inputs)
         if probe.trim:
             options += _option("trim", f"{probe.trim:.10g}")
         if masks := [shot.mask for shot in probe.shot if shot.mask]:
@@ -619,6 +622,7 @@ class _Planner:
             inputs.append(probe.camera)
         elif probe.lens:
             options += _option("lens", lens_text(probe.lens))
+        options += _vignetting(probe, inputs)
         if self.scene.align:
             options += _option("align", f"{self.build}/align.json")
             inputs.append(f"{self.build}/align.json")
@@ -828,6 +832,8 @@ class _Planner:
             solved = scene.hdr.response or f"{self.build}/response.json"
             inputs.append(solved if look.response == "plate" else look.response)
             pictures.append(f"{stem}.camera.png")
+        if isinstance(look.vignetting, str):
+            inputs += map(str, file_of(look.vignetting))
         if look.jpeg is not None:
             pictures.append(f"{stem}.camera.jpg")
         counts = (("object", len(scene.object)), ("light", len(scene.light)))
@@ -926,6 +932,20 @@ def _clicked(align: Align) -> str:
 def _option(name: str, value: str) -> tuple[str, ...]:
     """``--name value``; a value that begins with a minus sign is tied to its name."""
     return (f"--{name}={value}",) if value.startswith("-") else (f"--{name}", value)
+
+
+def _vignetting(probe: Probe, inputs: list[str]) -> tuple[str, ...]:
+    """The option of a fall-off that is known; its file is one of the `inputs`."""
+    text = vignetting_text(probe.vignetting)
+    inputs += map(str, file_of(text))
+    return () if text is None else _option("vignetting", text)
+
+
+def vignetting_text(value: list[float] | str, root: Path | None = None) -> str | None:
+    """A fall-off as --vignetting takes it; a file's path from `root` on."""
+    if isinstance(value, str):
+        return value if root is None or not file_of(value) else str(root / value)
+    return ",".join(repr(c) for c in value) if value else None
 
 
 def _filters(bracket: Bracket) -> tuple[str, ...]:

@@ -51,7 +51,8 @@ class Bracket(Table, frozen=True):
     the pictures' metadata is silent. With ``device`` (``visca:/dev/ttyUSB0``) and ``video``
     (``v4l2:/dev/video0``), `acquire bracket` makes ``take``. ``nd``: stops of the
     neutral-density filter, one for all frames or one a frame. ``handheld``: the frames are
-    aligned; ``moving``: what moved is taken from one exposure.
+    aligned; ``moving``: what moved is taken from one exposure. ``vignetting``: the lens's
+    fall-off, a vignette.json, that the merge divides by.
     """
 
     name: Name
@@ -64,6 +65,7 @@ class Bracket(Table, frozen=True):
     nd: list[float] = []
     handheld: bool = False
     moving: bool = False
+    vignetting: str | None = None
 
 
 class Meter(Table, frozen=True):
@@ -132,9 +134,10 @@ class Shot(Table, frozen=True):
 class Probe(Table, frozen=True):
     """The light probe: shots with one lens, a model of it or a ``camera`` file.
 
-    ``vignetting``: c1, c2, ... of the fall-off 1 + c1 r^2 + c2 r^4 + ..., r = 1 at the rim of
-    the image circle; measured values are divided by it. ``trim``: degrees at the rim of the
-    circle that are left out. ``refine``: turn the shots from what they see together;
+    ``vignetting``: a vignette.json, or c1, c2, ... of the fall-off 1 + c1 r^2 + c2 r^4 + ...,
+    r = 1 at the rim of the image circle; measured values are divided by it. ``trim``: degrees
+    at the rim of the circle that are left out. ``refine``: turn the shots from what they see
+    together;
     ``refine_lens``: and solve for the lens' field of view and the circles' centres.
     Of mirror balls: ``camera`` is the one that photographed them (far away without),
     ``reflectance`` is divided by, and ``photographer`` degrees about the direction to the
@@ -147,7 +150,7 @@ class Probe(Table, frozen=True):
     shot: list[Shot]
     lens: Lens | None = None
     camera: str | None = None
-    vignetting: list[float] = []
+    vignetting: list[float] | str = []
     trim: Annotated[float, Meta(ge=0)] = 0.0
     refine: bool = True
     refine_lens: bool = False
@@ -160,8 +163,6 @@ class Probe(Table, frozen=True):
     def __post_init__(self) -> None:
         if self.stitch and len(self.shot) < 2:
             raise ValueError("stitch needs two shots or more")
-        if self.stitch and self.vignetting:
-            raise ValueError("stitch finds the vignetting itself: leave it out")
         if self.stitch and (
             self.trim or not self.refine or self.reflectance != (1.0, 1.0, 1.0)
         ):
@@ -524,8 +525,9 @@ class Look(Table, frozen=True):
     """The plate camera's own faults, given to what is synthetic.
 
     ``noise``: of the plate's variance and grain, from its ``sigma`` channels (`hdr merge
-    --sigma`) where it has them. ``softness``: edges as soft as the plate's. ``vignetting``:
-    c1, c2, ... of the fall-off 1 + c1 r^2 + c2 r^4 + ..., r = 1 at half the plate's diagonal.
+    --sigma`) where it has them. ``softness``: edges as soft as the plate's. ``vignetting``: a
+    vignette.json, or c1, c2, ... of the fall-off 1 + c1 r^2 + c2 r^4 + ..., r = 1 at half the
+    plate's diagonal; a plate whose own was divided out gets it back as well.
     ``response``: `plate`, the curve that the plate was merged with, or a response.json; makes
     VIEW.camera.png, the codes that the camera would have given at the exposure of the plate's
     frame number ``frame`` (from 0; unless given, the one that shows most). ``jpeg``: quality
@@ -534,7 +536,7 @@ class Look(Table, frozen=True):
 
     noise: bool = False
     softness: bool = False
-    vignetting: list[float] = []
+    vignetting: list[float] | str = []
     response: str | None = None
     frame: Annotated[int, Meta(ge=0)] | None = None
     jpeg: Annotated[int, Meta(ge=1, le=100)] | None = None

@@ -97,7 +97,7 @@ class Vignette:
         radius: float | None = None,
         covariance: Float | None = None,
     ) -> Vignette:
-        """A polynomial that is known; by default r = 1 at half the diagonal about the middle."""
+        """A known polynomial; r = 1 at half the diagonal about the middle by default."""
         width, height = size
         c = np.array(coefficients, float)
         known = cls(
@@ -119,12 +119,14 @@ class Vignette:
     def at(self, pixels: ArrayLike) -> Float:
         """V at `pixels` (..., 2), (...)."""
         q = np.asarray(pixels, float)
-        return self._value(q[..., 0], q[..., 1])
+        x, y = q.reshape(-1, 2).T
+        return self._value(x, y).reshape(q.shape[:-1])
 
     def sigma_at(self, pixels: ArrayLike) -> Float:
         """Relative standard error of V at `pixels` (..., 2), (...)."""
         q = np.asarray(pixels, float)
-        return _between(self.sigma, self.size, q[..., 0], q[..., 1])
+        x, y = q.reshape(-1, 2).T
+        return _between(self.sigma, self.size, x, y).reshape(q.shape[:-1])
 
     def picture(
         self, size: tuple[int, int] | None = None, rows: tuple[int, int] | None = None
@@ -146,7 +148,7 @@ class Vignette:
         first, last = rows or (0, height)
         x = (np.arange(width) + 0.5) * (self.size[0] / width) - 0.5
         y = (np.arange(first, last) + 0.5) * (self.size[1] / height) - 0.5
-        value = self._value(x[None, :], y[:, None])
+        value = self._value(np.asarray(x[None, :], float), np.asarray(y[:, None], float))
         if value.size and value.min() < LEAST:
             raise UserError(
                 "the vignetting falls below 1 % inside the picture: it holds only up to "
@@ -343,6 +345,24 @@ def parse_cal(text: str, path: str | os.PathLike[str] = "vignetting.cal") -> tup
     if odd or not all(map(math.isfinite, terms.values())):
         raise UserError(f"odd powers of r in it: {odd}; a fall-off has even ones", file=path)
     return tuple(terms.get(2 * k, 0.0) for k in range(1, max(terms) // 2 + 1))
+
+
+def read_known(text: str, what: str = "--vignetting") -> Given:
+    """As :func:`read_given`, where no image circle is known that a ``.cal`` could count from.
+
+    Raises
+    ------
+    UserError
+        With what is wrong with it.
+
+    """
+    if text.endswith(".cal"):
+        raise UserError(
+            f"{what}: it counts from the rim of an image circle, which is told to `envmap`: "
+            "give it there, or a vignette.json here",
+            file=text,
+        )
+    return read_given(text, what)
 
 
 def resolved(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -111,6 +111,13 @@ def read_frame(path: str | os.PathLike[str], response: Response | None = None) -
         focal,
         gathered=1.0 if gathered is None else gathered,
     )
+
+
+def divided(frame: Frame, falloff: NDArray[np.float32]) -> Frame:
+    """The frame without a lens's fall-off (H, W) that is known."""
+    gain = np.float32(1) / falloff[..., None]
+    sigma = None if frame.sigma is None else frame.sigma * gain
+    return replace(frame, radiance=frame.radiance * gain, sigma=sigma)
 
 
 def check_alike(frames: list[Frame]) -> None:

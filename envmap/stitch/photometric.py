@@ -74,6 +74,11 @@ class Photometric:
         """Standard errors of the fall-off, (TERMS,)."""
         return np.sqrt(np.maximum(np.diag(self.falloff_covariance), 0))
 
+    @property
+    def falloff_told(self) -> bool:
+        """Whether the fall-off by itself is more than its error."""
+        return self.applied and _tells(self.falloff, self.falloff_covariance)
+
     def vignette(self, camera: CameraModel) -> Vignette:
         """The fall-off of the lens, for pictures of other sessions."""
         centre, reach, circle = optics(camera)

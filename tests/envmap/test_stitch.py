@@ -549,7 +549,7 @@ def test_a_scene_is_planned_and_stitched(tmp_path: Path) -> None:
     run("envmap", "stitch", tmp_path / "scene.toml", "-o", tmp_path / "build/env.exr")
     found = read_directions(tmp_path / "build/env.directions.json", ["f0", "f1", "f2"])
     assert misplaced(found.rotations, turns()[:3]) < 0.05
-    for wrong in ("vignetting = [0.1]", "trim = 1"):
+    for wrong in ("refine = false", "trim = 1"):
         (tmp_path / "scene.toml").write_text(text.replace("sigma = 3", wrong))
         with pytest.raises(UserError, match="stitch"):
             read_scene(tmp_path / "scene.toml")

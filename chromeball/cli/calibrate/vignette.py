@@ -6,12 +6,12 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import App, Parameter
 
-from chromeball.cli.calibrate.arguments import Json, Out, print_figures, say
-from chromeball.cli.calibrate.vignette_overlap import overlap
+from chromeball.cli.calibrate.arguments import Json, Out, say
+from chromeball.cli.calibrate.vignette_overlap import figures_of, overlap, told
 from chromeball.cli.options import Numbers
 from chromeball.scene.errors import UserError
 from chromeball.scene.record import Stage, atomic_output, check_output
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from chromeball.calibrate.vignette import Solved
     from chromeball.calibrate.vignette_samples import Picture
     from chromeball.hdr.response_file import Response
-    from chromeball.scene.vignette import Vignette
 
 type Images = Annotated[list[Path], Parameter(required=True)]
 
@@ -107,7 +106,7 @@ def board(
             "light_curvature": solved.light_sigma[1],
         }
         _write(stage, output, solved, aperture, counted.samples.pixels)
-    _print(stage, output, json)
+    told(stage, output, solved.vignette, solved.scatter, json)
 
 
 @app.command
@@ -209,7 +208,7 @@ def flat(
                 f"{field.edge_share:.0%} of the directions: radius {field.edge.radius:.0f} px "
                 f"about {x:.0f}, {y:.0f}"
             )
-    _print(stage, output, json)
+    told(stage, output, solved.vignette, solved.scatter, json)
 
 
 app.command(overlap)
@@ -306,51 +305,3 @@ def _write(
     full = replace(found, aperture=aperture, record=dict(stage.figures))
     with stage.output(output) as temporary:
         temporary.write_bytes(full.encode())
-
-
-def figures_of(found: Vignette) -> dict[str, Any]:
-    """What is said of every measured fall-off."""
-    import numpy as np
-
-    from chromeball.scene.vignette import lattice
-
-    V, sigma = found.at(lattice(found.size)), found.sigma
-    sure = np.diag(found.covariance)
-    return {
-        "coefficients": found.coefficients,
-        "coefficients_sigma": np.sqrt(np.maximum(sure, 0)),
-        "centre": found.centre,
-        "covered": found.covered,
-        "beyond_covered_share": found.beyond(),
-        "least": float(V.min()),
-        "sigma_median": float(np.median(sigma)),
-        "sigma_largest": float(sigma.max()),
-    }
-
-
-def _print(stage: Stage, output: Path, as_json: Literal[True, False]) -> None:
-    f = stage.figures
-    beyond = f["beyond_covered_share"]
-    if beyond > 0.02:
-        say(
-            f"note: {beyond:.0%} of the picture lies farther out than what was measured: the "
-            "polynomial goes on there, and its error says how far it is to be trusted"
-        )
-    if as_json:
-        print_figures(f)
-        return
-    terms = ", ".join(
-        f"{c:.4f} +- {s:.2g}"
-        for c, s in zip(f["coefficients"], f["coefficients_sigma"], strict=True)
-    )
-    print(f"{output}: 1 + c1 r^2 + ..., {terms}" + (", and a smooth map" if f["map"] else ""))
-    x, y = f["centre"]
-    print(
-        f"centre {x:.1f}, {y:.1f}; {f['least']:.2f} of the light at the darkest place, error "
-        f"{f['sigma_median']:.2%} (median), {f['sigma_largest']:.2%} at most"
-    )
-    before, after = f["scatter"]
-    print(
-        f"scatter {before:.2%} before, {after:.2%} after; {f['outliers']} outliers; "
-        f"measured to {f['covered']:.0%} of the radius"
-    )

@@ -72,7 +72,9 @@ def probe(
     reflectance
         Of the ball, one number or r,g,b (1): the map is divided by it.
     vignetting
-        Fall-off c1,c2,... of 1 + c1 r^2 + c2 r^4 + ..., r = 1 at the rim of the circle.
+        Fall-off of the camera, divided out: a vignette.json of `calibrate vignette`, or of a
+        fisheye c1,c2,... of 1 + c1 r^2 + c2 r^4 + ..., r = 1 at the rim of its circle, or
+        HDRICalibrationTool's .cal of such.
     trim
         Leave out the outermost degrees of the image circle, where its edge is soft (0).
     mask
@@ -151,7 +153,7 @@ def probe(
             lenses=[camera] * count if camera else each(lenses, "--lens"),
             balls=each(balls, "--ball"),
             masks=each(list(mask or []), "--mask"),
-            vignetting=parse_numbers(vignetting, "--vignetting", None) if vignetting else [],
+            vignetting=vignetting,
             photographer=20.0 if photographer is None else photographer,
             reflectance=_rgb(reflectance, "--reflectance") or [1.0, 1.0, 1.0],
             trim=trim or 0.0,
@@ -188,7 +190,7 @@ def _fill(text: str | None) -> tuple[Path, Path] | None:
 
 
 def _probe_of_scene(path: Path, output: Path, as_json: bool) -> None:
-    from chromeball.cli.stages import lens_text
+    from chromeball.cli.stages import lens_text, vignetting_text
     from chromeball.scene.manifest import read_scene
 
     scene = read_scene(path)
@@ -225,7 +227,7 @@ def _probe_of_scene(path: Path, output: Path, as_json: bool) -> None:
             ],
             balls=[None if shot.ball is None else list(shot.ball) for shot in shots],
             masks=[root / shot.mask if shot.mask else None for shot in shots],
-            vignetting=entry.vignetting,
+            vignetting=vignetting_text(entry.vignetting, root),
             photographer=entry.photographer,
             reflectance=list(entry.reflectance),
             trim=entry.trim,

@@ -17,6 +17,7 @@ from chromeball.cli.envmap.arguments import (
     write_panorama,
 )
 from chromeball.scene.errors import UserError
+from chromeball.scene.vignette import check_once, file_of, read_given
 
 if TYPE_CHECKING:
     from chromeball.envmap.mapping import Mapping
@@ -40,7 +41,7 @@ class Request:
     lenses: list[str | Path | None]
     balls: list[list[float] | None]
     masks: list[Path | None]
-    vignetting: list[float]
+    vignetting: str | None
     photographer: float
     reflectance: list[float]
     trim: float
@@ -56,7 +57,7 @@ class Request:
     def inputs(self) -> list[Path]:
         """All files that it reads, each once."""
         cameras = [lens for lens in self.lenses if isinstance(lens, Path)]
-        others = [*self.masks, self.align, *(self.fill or ())]
+        others = [*self.masks, self.align, *(self.fill or ()), *file_of(self.vignetting)]
         named = [*self.files, *cameras, *(path for path in others if path is not None)]
         return list(dict.fromkeys(named))
 
@@ -182,10 +183,17 @@ def _shot(request: Request, k: int, image: Radiance) -> tuple[Shot, float | None
     from chromeball.envmap.ball import ball_in_circle
     from chromeball.envmap.mapping import Lens, of_camera
     from chromeball.envmap.probe import Shot, without_vignetting
+    from chromeball.scene.vignette import Vignette
 
     file, ball = request.files[k], request.balls[k]
     camera = _camera(request.lenses[k], image.size, file)
     rgb, valid, clipped, sigma = image.rgb, image.valid, image.clipped, image.sigma
+    falloff = None if request.vignetting is None else read_given(request.vignetting)
+    if falloff is not None:
+        check_once(image.attributes, file)
+    if isinstance(falloff, Vignette):  # of the whole picture, before a ball is cut out of it
+        gain = np.float32(1) / falloff.picture(image.size)[..., None]
+        rgb, sigma, falloff = rgb * gain, None if sigma is None else sigma * gain, None
     mask = request.masks[k]
     if mask is not None:
         allowed = read_mask(mask, image.size, file)
@@ -211,8 +219,8 @@ def _shot(request: Request, k: int, image: Radiance) -> tuple[Shot, float | None
     back = math.radians(request.photographer) if ball is not None else 0.0
     shot = Shot(rgb, mapping, a, b, c, valid, back, clipped, sigma)
     try:
-        if request.vignetting:
-            shot = without_vignetting(shot, request.vignetting)
+        if falloff is not None:
+            shot = without_vignetting(shot, falloff)
     except UserError as error:
         raise UserError(error.what, file=file) from error
     bound = None if clipped is None else float(shot.mapping.solid_angles()[clipped].sum())

@@ -13,6 +13,7 @@ from chromeball.cli.envmap.arguments import (
 from chromeball.cli.envmap.stitch_map import Bend, Expose, Refine, make_map
 from chromeball.cli.options import Numbers
 from chromeball.scene.errors import UserError
+from chromeball.scene.vignette import file_of
 
 if TYPE_CHECKING:
     from chromeball.envmap.stitch.links import Prior
@@ -34,6 +35,7 @@ def stitch(
     clicked: int | None = None,
     response: Path | None = None,
     exposure: Expose = "auto",
+    vignetting: str | None = None,
     bend: Bend = "auto",
     width: int | None = None,
     output: Out,
@@ -42,7 +44,8 @@ def stitch(
     """Frames of several directions to one lat-long map, in linear radiance throughout.
 
     Beside the map: its preview, the frames' borders and the seams, the panorama through the
-    lens beside a frame, the refined lens (.cameramodel) and directions (.directions.json).
+    lens beside a frame, the refined lens (.cameramodel) and directions (.directions.json), and
+    the fall-off that was found (.vignette.json).
 
     Parameters
     ----------
@@ -78,6 +81,10 @@ def stitch(
     exposure
         auto: exposures and vignetting are made equal where frames overlap; keep: they are
         right; white-balance: each channel by itself.
+    vignetting
+        Fall-off of the lens that is known, divided out and not solved: a vignette.json of
+        `calibrate vignette`, c1,c2,... of 1 + c1 r^2 + c2 r^4 + ... with r = 1 at the rim of
+        the circle or at the corner, or HDRICalibrationTool's .cal of such.
     bend
         auto: where the camera moved between frames (parallax) they are bent a little so that
         they meet, and that is told; no: they are not.
@@ -94,7 +101,7 @@ def stitch(
 
     if len(frames) == 1 and frames[0].suffix == ".toml":
         given = (camera, lens, refine, directions, yaw, pitch, roll, sigma, align, clicked)
-        if any(option is not None for option in (*given, response, width)):
+        if any(option is not None for option in (*given, vignetting, response, width)):
             raise UserError("a scene file says everything: leave out the other options")
         _of_scene(frames[0], output, json)
         return
@@ -126,11 +133,15 @@ def stitch(
         lens=lens,
         refine=refine,
         prior=prior,
-        inputs=[p for p in (camera, directions, align, response) if p is not None],
+        inputs=[
+            *(p for p in (camera, directions, align, response) if p is not None),
+            *file_of(vignetting),
+        ],
         align=align,
         clicked=clicked,
         response=response,
         exposure=exposure,
+        vignetting=vignetting,
         bend=bend,
         width=width,
         output=output,
@@ -140,7 +151,7 @@ def stitch(
 
 def _of_scene(path: Path, output: Path, as_json: bool) -> None:
     """The command that `plan` writes, for the scene as it is."""
-    from chromeball.cli.stages import lens_text
+    from chromeball.cli.stages import lens_text, vignetting_text
     from chromeball.scene.manifest import read_scene
 
     scene = read_scene(path)
@@ -166,6 +177,7 @@ def _of_scene(path: Path, output: Path, as_json: bool) -> None:
         pitch=angles("pitch"),
         roll=angles("roll"),
         sigma=probe.sigma,
+        vignetting=vignetting_text(probe.vignetting, root),
         align=root / scene.folder / "align.json" if scene.align else None,
         width=scene.env.width,
         output=output,

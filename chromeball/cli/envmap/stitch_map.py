@@ -52,6 +52,7 @@ def make_map(
     clicked: int | None,
     response: Path | None,
     exposure: Expose,
+    vignetting: str | None,
     bend: Bend,
     width: int | None,
     output: Path,
@@ -67,10 +68,12 @@ def make_map(
     from chromeball.envmap.stitch.bend import bend as bent_to_meet
     from chromeball.envmap.stitch.blend import compose
     from chromeball.envmap.stitch.features import find
+    from chromeball.envmap.stitch.frames import divided
     from chromeball.envmap.stitch.lens import pixel_focal
     from chromeball.envmap.stitch.orient import orient
-    from chromeball.envmap.stitch.photometric import solve, unchanged
+    from chromeball.envmap.stitch.photometric import optics, solve, unchanged
     from chromeball.scene.record import Stage, check_output, write_json
+    from chromeball.scene.vignette import check_once, read_given, resolved
 
     names = [path.stem for path in files]
     if len(files) < 2:
@@ -80,13 +83,20 @@ def make_map(
     if width is not None:
         check_panorama_width(width)
     check_output(output, [*files, *inputs], ".exr")
-    with Stage("envmap stitch", [*files, *inputs], width=width, exposure=exposure) as stage:
+    falloff = None if vignetting is None else read_given(vignetting)
+    settings = {"width": width, "exposure": exposure, "vignetting": vignetting}
+    with Stage("envmap stitch", [*files, *inputs], **settings) as stage:
         frames = read_frames(files, response)
         features = []
         for frame in frames:
             _say(f"features of {frame.name}")
             features.append(find(frame.radiance, frame.valid))
         model, freedom, lens_notes = lens_of(camera, lens, refine, frames, features)
+        if falloff is not None:
+            for frame, path in zip(frames, files, strict=True):
+                check_once(frame.attributes, path)
+            known = resolved(falloff, model.size, *optics(model)[:2]).picture(model.size)
+            frames = [divided(frame, known) for frame in frames]
         found = orient(
             features, model, freedom=freedom, prior=prior, names=names, progress=_say
         )
@@ -107,11 +117,15 @@ def make_map(
             light = unchanged(len(frames))
         else:
             light = solve(
-                frames, found.camera, rotations, white_balance=exposure == "white-balance"
+                frames,
+                found.camera,
+                rotations,
+                white_balance=exposure == "white-balance",
+                falloff=falloff is None,
             )
         if width is None:
-            resolved = 2 * math.pi * pixel_focal(found.camera)
-            width = min(WIDEST, max(64, 64 * round(resolved / 64)))
+            around = 2 * math.pi * pixel_focal(found.camera)
+            width = min(WIDEST, max(64, 64 * round(around / 64)))
         result = compose(frames, found.camera, rotations, width, light, progress=_say)
         missing = result.alpha == 0
         completed = from_border(result.radiance, missing) * float(Source.BORDER)
@@ -171,6 +185,9 @@ def make_map(
             found.camera.write(temporary)
         with stage.output(output.with_name(f"{output.stem}.directions.json")) as temporary:
             write_json(temporary, _directions(names, rotations, found))
+        if light.falloff_told:
+            with stage.output(output.with_name(f"{output.stem}.vignette.json")) as temporary:
+                temporary.write_bytes(light.vignette(found.camera).encode())
         kept = dict(frames[0].attributes)
         write_panorama(
             stage,

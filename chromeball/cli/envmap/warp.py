@@ -77,8 +77,9 @@ def warp(
     to_lens
         The fisheye that is made, where both maps are fisheyes.
     vignetting
-        Fall-off c1,c2,... of 1 + c1 r^2 + c2 r^4 + ... of the fisheye that is read, r = 1 at
-        the rim of its circle.
+        Fall-off of the fisheye that is read, divided out: a vignette.json of `calibrate
+        vignette`, c1,c2,... of 1 + c1 r^2 + c2 r^4 + ..., r = 1 at the rim of its circle, or
+        HDRICalibrationTool's .cal of such.
     ball_distance
         From the camera to the mirror ball's centre, in ball radii; without it the ball is far.
     focal
@@ -108,6 +109,7 @@ def warp(
     from chromeball.envmap.probe import rotation, vignetting_gain
     from chromeball.envmap.resample import Warping, marking
     from chromeball.scene.record import Stage, check_output
+    from chromeball.scene.vignette import REMOVED, check_once, file_of, read_given
 
     angles = parse_numbers(rotate, "--rotate", 3) if rotate is not None else [0.0, 0.0, 0.0]
     if width is not None and not 1 <= width <= 65536:
@@ -116,8 +118,9 @@ def warp(
     optics.check(from_, to)
     if vignetting is not None and from_ != "fisheye":
         raise UserError("--vignetting is of a fisheye that is read: --from fisheye")
-    falloff = parse_numbers(vignetting, "--vignetting", None) if vignetting is not None else []
+    falloff = None if vignetting is None else read_given(vignetting)
     inputs = [*files_of(picture, from_), *(path for path in (camera, mask) if path)]
+    inputs += file_of(vignetting)
     outputs = files_of(output, to)
     for path in outputs:
         check_output(path, inputs, ".exr")
@@ -135,7 +138,9 @@ def warp(
     else:
         source = source_map(from_, image.size, optics, picture)
         target = target_map(to, width, optics, source)
-    if falloff:
+    if falloff is not None:
+        check_once(kept, picture)
+        kept[REMOVED] = str(vignetting)
         gain = vignetting_gain(source, falloff).astype(np.float32)[..., None]
         image = replace(
             image,
@@ -143,7 +148,7 @@ def warp(
             sigma=None if image.sigma is None else image.sigma * gain,
         )
     turn = rotation(*(math.radians(a) for a in angles))
-    with Stage("envmap warp", inputs, to=to, fast=fast, vignetting=falloff) as stage:
+    with Stage("envmap warp", inputs, to=to, fast=fast, vignetting=vignetting) as stage:
         job = Warping(
             image.rgb,
             source,
