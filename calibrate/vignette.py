@@ -23,6 +23,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from chromeball.calibrate.vignette_map import bilinear, smooth
 from chromeball.scene.errors import UserError
 from chromeball.scene.vignette import (
     LATTICE,
@@ -44,13 +45,22 @@ TERMS, FEWEST, EARNED = 4, 2, 2.0
 COEFFICIENT, PRINCIPAL, MIDDLE = 3.0, 0.02, 0.05
 #: Residuals beyond so many robust deviations are outliers.
 OUTLIER = 4.0
-#: Prior deviations of the map's bends and values.
-BEND, VALUE = 0.01, 0.1
 #: The map is asked for when it explains so many standard deviations of chi-square too much,
 #: and is at least so large.
 ASKED, WORTH = 6.0, 0.002
 #: r that the samples must reach, and the relative error of V there that is no measurement.
 REACH, WORST = 0.5, 0.05
+#: Least relative error of a place: paper and print, or a panel's grain.
+PAPER = 0.002
+
+
+@dataclass(frozen=True)
+class Picture:
+    """``radiance`` (H, W) linear; ``unusable`` (H, W): saturated, or not valid."""
+
+    name: str
+    radiance: NDArray[np.float32]
+    unusable: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -249,7 +259,7 @@ class _Problem:
         """Gauss-Newton on the fall-off, EM on the variances, unless these are `fixed`."""
         s = self.samples
         groups, L = int(s.group.max()) + 1, s.light.shape[1]
-        nodes = _bilinear(s.pixels, self.size) if mapped else np.zeros((len(s.log), 0))
+        nodes = bilinear(s.pixels, self.size) if mapped else np.zeros((len(s.log), 0))
         centre = 2 * self.free_centre if count else 0
         head = count + centre
         columns = head + s.shared.shape[1] + nodes.shape[1]
@@ -257,7 +267,7 @@ class _Problem:
         prior[:count, :count] = np.eye(count) / COEFFICIENT**2
         prior[count:head, count:head] = np.eye(centre) / self.stray**2
         if mapped:
-            prior[-nodes.shape[1] :, -nodes.shape[1] :] = _smooth()
+            prior[-nodes.shape[1] :, -nodes.shape[1] :] = smooth()
         local = np.concatenate([np.ones((len(s.log), 1)), s.light], axis=1)
         weight = np.where(keep, 1 / s.sigma**2, 0.0)
         kinds = np.array(s.kinds, int)
@@ -347,7 +357,7 @@ class _Problem:
         shared = self.samples.shared.shape[1]
         J = np.concatenate([J, np.zeros((len(nodes), shared))], axis=1)
         if mapped:  # against the map's own value at the centre: V is 1 there
-            at = _bilinear(centre[None], self.size)
+            at = bilinear(centre[None], self.size)
             grid -= at[0] @ grid
             J = np.concatenate([J, np.eye(len(nodes)) - at], axis=1)
         sigma = np.sqrt(np.maximum(np.einsum("nc,cd,nd->n", J, fit.covariance, J), 0))
@@ -434,26 +444,6 @@ def _normal(
     blocks = np.add.reduceat((wl[:, :, None] * local[:, None, :])[order], starts, axis=0)
     gl = np.add.reduceat((wl * y[:, None])[order], starts, axis=0)
     return wJ.T @ J, B, blocks, wJ.T @ y, gl
-
-
-def _bilinear(pixels: Float, size: tuple[int, int]) -> Float:
-    """Weights of the lattice's nodes at `pixels` (N, 2), (N, rows * columns)."""
-    rows, columns = LATTICE
-    u = np.clip(pixels[:, 0] * ((columns - 1) / max(size[0] - 1, 1)), 0, columns - 1)
-    v = np.clip(pixels[:, 1] * ((rows - 1) / max(size[1] - 1, 1)), 0, rows - 1)
-    across = np.maximum(1 - np.abs(u[:, None] - np.arange(columns)), 0)
-    down = np.maximum(1 - np.abs(v[:, None] - np.arange(rows)), 0)
-    return (down[:, :, None] * across[:, None, :]).reshape(len(pixels), -1)
-
-
-def _smooth() -> Float:
-    """Prior of the map: second differences of BEND, values of VALUE."""
-    rows, columns = LATTICE
-    identity = np.eye(rows * columns).reshape(-1, rows, columns)
-    bends = [np.diff(identity, 2, axis=1), np.diff(identity, 2, axis=2)]
-    bends.append(math.sqrt(2) * np.diff(np.diff(identity, axis=1), axis=2))
-    flat = np.concatenate([b.reshape(rows * columns, -1) for b in bends], axis=1)
-    return flat @ flat.T / BEND**2 + np.eye(rows * columns) / VALUE**2
 
 
 def apertures_agree(apertures: Sequence[float | None]) -> float | None:

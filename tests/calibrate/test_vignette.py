@@ -13,22 +13,23 @@ import pytest
 from numpy.typing import NDArray
 
 from chromeball.calibrate.target import Charuco, Chessboard, Target
-from chromeball.calibrate.vignette import Samples, apertures_agree, solve
-from chromeball.calibrate.vignette_samples import (
-    Picture,
-    board_samples,
-    check_gradient,
-    flat_samples,
-)
+from chromeball.calibrate.vignette import Picture, Samples, apertures_agree, solve
+from chromeball.calibrate.vignette_board import board_samples
+from chromeball.calibrate.vignette_field import check_gradient, flat_samples
 from chromeball.calibrate.virtual import board_poses, project
 from chromeball.cli.main import build_app
+from chromeball.cli.stages import stages
+from chromeball.renderer.composite import Composite
+from chromeball.renderer.look import CameraLook, apply_look, fall_off
 from chromeball.scene.camera import CameraModel
 from chromeball.scene.color import srgb_decode, srgb_encode
 from chromeball.scene.errors import UserError
 from chromeball.scene.image import read_image, write_exr, write_picture
+from chromeball.scene.manifest import read_scene
 from chromeball.scene.pose import Pose
 from chromeball.scene.record import read_json
 from chromeball.scene.vignette import Vignette, read_vignette
+from tests.cli.scenes import FULL, PHOTOS
 
 type Float = NDArray[np.float64]
 
@@ -211,7 +212,7 @@ def test_refusals() -> None:
     with pytest.raises(UserError, match="needs 30"):
         solve(samples.of(samples.group < 1), SIZE, source="board")
     with pytest.raises(UserError, match="leave the fall-off open"):
-        solve(drawn(0, 4, 0.4), SIZE, source="board")
+        solve(drawn(0, 4, 0.4, noise=0.03), SIZE, source="board")
     bright = [np.where(c > 120, 255, c).astype(np.uint8) for c in views(BOARD, 4, 1, 0.0)]
     with pytest.raises(UserError, match=r"white is saturated in \d+ of"):
         measured(bright, BOARD, 1)
@@ -273,9 +274,15 @@ def test_a_hard_edge_is_no_optical_fall_off(cut: tuple[float, float, float]) -> 
     seen = flat_samples([field(0, cut=cut)], None)
     assert seen.edge is not None
     np.testing.assert_allclose([*seen.edge.centre, seen.edge.radius], cut, atol=5)
-    x, y, radius = cut
-    round_ = {"centre": (x, y), "radius": radius} if radius < H / 2 else {}
-    found = solve(seen.samples, (W, H), source="flat", edge=seen.edge, **round_).vignette
+    whole = cut[2] < H / 2
+    found = solve(
+        seen.samples,
+        (W, H),
+        source="flat",
+        edge=seen.edge,
+        centre=cut[:2] if whole else None,
+        radius=cut[2] if whole else None,
+    ).vignette
     assert off_by(found, seen.samples.pixels) < 0.01
     assert flat_samples([field(0)], None).edge is None
 
@@ -319,3 +326,118 @@ def test_flat_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     ):
         with pytest.raises(UserError, match=message):
             run("flat", *files, *words, "-o", out)
+
+
+# ---- applied
+
+
+def test_merge_divides_by_it_once(tmp_path: Path) -> None:
+    """Flat again, standard errors with it; told in the file, and not done twice."""
+    truth = Vignette.of([-0.4, 0.1], (60, 40), (31.0, 18.0))
+    (tmp_path / "v.json").write_bytes(truth.encode())
+    V = truth.picture()[..., None].repeat(3, axis=2)
+    files = [tmp_path / f"{k}.exr" for k in range(2)]
+    for file, time in zip(files, (0.5, 1.0), strict=True):
+        write_exr(file, 0.6 * V * np.float32(time))
+    common = ("merge", *files, "--times", "0.5,1", "--white", "1", "--sigma")
+    app = build_app()
+    for extra, name in (((), "plain"), (("--vignetting", tmp_path / "v.json"), "even")):
+        words = [
+            "hdr",
+            *common,
+            *extra,
+            "--noise",
+            "1e-4",
+            "1e-6",
+            "-o",
+            tmp_path / f"{name}.exr",
+        ]
+        app([str(w) for w in words], result_action="return_value")
+    plain, even = (read_image(tmp_path / f"{n}.exr") for n in ("plain", "even"))
+    np.testing.assert_allclose(even.pixels[..., :3], 0.6, rtol=1e-5)
+    np.testing.assert_allclose(even.pixels[..., 3:6], plain.pixels[..., 3:6] / V, rtol=1e-5)
+    assert "v.json" in even.attributes["vignettingRemoved"]
+    lens = ("--lens", "equisolid:180", "--from", "fisheye", "--to", "latlong")
+    words = [
+        "envmap",
+        "warp",
+        tmp_path / "even.exr",
+        *lens,
+        "--vignetting",
+        tmp_path / "v.json",
+    ]
+    with pytest.raises(UserError, match="divided out already"):
+        app([str(w) for w in [*words, "-o", tmp_path / "x.exr"]], result_action="return_value")
+    with pytest.raises(UserError, match="a crop needs"):
+        write_exr(tmp_path / "small.exr", 0.6 * V[:20])
+        words = [
+            "hdr",
+            "merge",
+            tmp_path / "small.exr",
+            "--times",
+            "1",
+            "-o",
+            tmp_path / "y.exr",
+        ]
+        words += ["--vignetting", tmp_path / "v.json"]
+        app([str(w) for w in words], result_action="return_value")
+
+
+def test_maps_divide_by_it(tmp_path: Path) -> None:
+    """A file and the coefficients it holds give one map, by warp and by probe."""
+    size = (64, 64)
+    rim = Vignette.of([-0.4, 0.1], size, (31.5, 31.5), 32.0)
+    (tmp_path / "v.json").write_bytes(rim.encode())
+    r2 = ((CameraModel.pinhole(size, 1.0).pixel_grid() - 31.5) ** 2).sum(axis=2) / 32**2
+    dim = np.maximum(1 - 0.4 * r2 + 0.1 * r2**2, 0.1)
+    write_exr(tmp_path / "dim.exr", dim[..., None].repeat(3, 2).astype(np.float32))
+    app = build_app()
+    for command in (["warp", "--from", "fisheye", "--to", "latlong"], ["probe"]):
+        maps: list[Any] = []
+        for how in ("--vignetting=-0.4,0.1", f"--vignetting={tmp_path / 'v.json'}"):
+            words = ["envmap", command[0], tmp_path / "dim.exr", *command[1:], how]
+            words += ["--lens", "equisolid:180", "--width", "64", "-o", tmp_path / "m.exr"]
+            app([str(w) for w in words], result_action="return_value")
+            maps.append(read_image(tmp_path / "m.exr").pixels)
+        seen = maps[0][..., 3] == 1
+        np.testing.assert_allclose(maps[1][seen], maps[0][seen], rtol=1e-5)
+        np.testing.assert_allclose(maps[1][seen][:, :3], 1, atol=5e-3)
+
+
+def test_the_renderer_gives_it_back() -> None:
+    """On what is synthetic; on all where it was divided out of the plate."""
+    truth = Vignette.of([-0.3, 0.1], (80, 60), (37.0, 31.0))
+    V = fall_off(truth, CameraModel.pinhole((80, 60), 1.0))
+    np.testing.assert_array_equal(V, truth.picture())
+    plate = np.full((60, 80, 3), 0.5, np.float32)
+    ones, flat = np.ones_like(plate), np.zeros((60, 80), np.float32)
+    made = Composite(
+        plate + 1, flat, ones, ones, flat, flat, np.ones((60, 80), bool), 0, ones, ones
+    )
+    for flattened, expected in ((False, 0.5 + V), (True, 1.5 * V)):
+        seen, _ = apply_look(made, plate, CameraLook(falloff=V, flattened=flattened))
+        np.testing.assert_allclose(seen.rgb[..., 0], expected, rtol=1e-6)
+
+
+def test_scene_keys(tmp_path: Path) -> None:
+    """A file of bracket, probe or look is an option and an input of its stage."""
+    text = FULL.replace('name = "plate"\n', 'name = "plate"\nvignetting = "tele.json"\n')
+    text = text.replace("shot = [", 'vignetting = "fish.json"\nshot = [')
+    text = text.replace(
+        'bracket = "plate"\npoints',
+        'bracket = "plate"\nlook = { vignetting = "tele.json" }\npoints',
+    )
+    (tmp_path / "photos").mkdir()
+    for name in PHOTOS:
+        write_picture(tmp_path / "photos" / name, np.zeros((8, 8, 3), np.uint8))
+    (tmp_path / "scene.toml").write_text(text)
+    plan = stages(read_scene(tmp_path / "scene.toml"), tmp_path / "scene.toml")
+    by_name = {stage.name: stage for stage in plan}
+    for name, file in (
+        ("hdr merge plate", "tele.json"),
+        ("envmap probe", "fish.json"),
+        ("render main", "tele.json"),
+    ):
+        assert file in by_name[name].inputs, name
+    assert "tele.json" in by_name["hdr merge plate"].command
+    assert "tele.json" not in by_name["hdr merge front"].command

@@ -17,8 +17,7 @@ from chromeball.scene.errors import UserError
 from chromeball.scene.record import Stage, atomic_output, check_output
 
 if TYPE_CHECKING:
-    from chromeball.calibrate.vignette import Solved
-    from chromeball.calibrate.vignette_samples import Picture
+    from chromeball.calibrate.vignette import Picture, Solved
     from chromeball.hdr.response_file import Response
 
 type Images = Annotated[list[Path], Parameter(required=True)]
@@ -67,7 +66,7 @@ def board(
     from chromeball.calibrate.detect import Detection, detect_files
     from chromeball.calibrate.target import parse_target
     from chromeball.calibrate.vignette import solve
-    from chromeball.calibrate.vignette_samples import board_samples
+    from chromeball.calibrate.vignette_board import board_samples
 
     sheet = parse_target(target)
     others = [path for path in (camera, response) if path is not None]
@@ -147,7 +146,7 @@ def flat(
     import numpy as np
 
     from chromeball.calibrate.vignette import solve
-    from chromeball.calibrate.vignette_samples import check_gradient, flat_samples
+    from chromeball.calibrate.vignette_field import check_gradient, flat_samples
 
     angles = None
     if turns is not None:
@@ -253,7 +252,7 @@ def _pictures(files: Sequence[Path], response: Path | None) -> Iterator[Picture]
     """Grey radiance of each file, one at a time."""
     import numpy as np
 
-    from chromeball.calibrate.vignette_samples import Picture
+    from chromeball.calibrate.vignette import Picture
     from chromeball.envmap.stitch.frames import read_frame
     from chromeball.scene.vignette import check_once
 
