@@ -159,7 +159,7 @@ def _hard_edge(
 
 
 def _circle(points: Float, tolerance: float) -> tuple[Edge | None, float, int]:
-    """The circle through most of `points` (N, 2), its RMS and how many these are (Kasa 1976)."""
+    """The circle through most of `points` (N, 2), its RMS, and how many these are."""
     p, edge, rms = points, None, math.inf
     for _ in range(4):
         A = np.concatenate([2 * p, np.ones((len(p), 1))], axis=1)

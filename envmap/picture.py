@@ -14,12 +14,14 @@ from numpy.typing import NDArray
 from chromeball.scene.color import luminance
 from chromeball.scene.errors import UserError
 from chromeball.scene.image import linear_rows, to_display, write_exr, write_picture
+from chromeball.scene.vignette import REMOVED
 
 #: What a map says about itself and is handed on, by OpenImageIO's names: `DateTime` is
 #: OpenEXR's capDate, `Copyright` its owner.
 KEPT = (
     *("chromaticities", "whiteLuminance", "origin", "worldToCamera"),
     *("DateTime", "utcOffset", "Copyright", "longitude", "latitude", "altitude"),
+    REMOVED,
 )
 
 

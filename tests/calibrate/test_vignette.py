@@ -368,19 +368,11 @@ def test_merge_divides_by_it_once(tmp_path: Path) -> None:
     ]
     with pytest.raises(UserError, match="divided out already"):
         app([str(w) for w in [*words, "-o", tmp_path / "x.exr"]], result_action="return_value")
+    write_exr(tmp_path / "small.exr", 0.6 * V[:20])
+    small = ["hdr", "merge", tmp_path / "small.exr", "--times", "1", "--vignetting"]
+    small += [tmp_path / "v.json", "-o", tmp_path / "y.exr"]
     with pytest.raises(UserError, match="a crop needs"):
-        write_exr(tmp_path / "small.exr", 0.6 * V[:20])
-        words = [
-            "hdr",
-            "merge",
-            tmp_path / "small.exr",
-            "--times",
-            "1",
-            "-o",
-            tmp_path / "y.exr",
-        ]
-        words += ["--vignetting", tmp_path / "v.json"]
-        app([str(w) for w in words], result_action="return_value")
+        app([str(w) for w in small], result_action="return_value")
 
 
 def test_maps_divide_by_it(tmp_path: Path) -> None:
@@ -400,7 +392,7 @@ def test_maps_divide_by_it(tmp_path: Path) -> None:
             app([str(w) for w in words], result_action="return_value")
             maps.append(read_image(tmp_path / "m.exr").pixels)
         seen = maps[0][..., 3] == 1
-        np.testing.assert_allclose(maps[1][seen], maps[0][seen], rtol=1e-5)
+        np.testing.assert_allclose(maps[1][seen], maps[0][seen], rtol=2e-3)
         np.testing.assert_allclose(maps[1][seen][:, :3], 1, atol=5e-3)
 
 
