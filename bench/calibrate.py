@@ -15,6 +15,7 @@ from bench import (
     calibrate_rig,
     calibrate_targets,
     calibrate_tracker,
+    calibrate_vignette,
     calibrate_wand,
 )
 from bench.row import Row
@@ -40,6 +41,7 @@ def rows(quick: bool) -> list[Row]:
         *calibrate_rig.rows(quick),
         *calibrate_targets.rows(quick),
         *calibrate_tracker.rows(quick),
+        *calibrate_vignette.rows(quick),
         *calibrate_wand.rows(quick),
     ]
 

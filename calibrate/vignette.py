@@ -17,13 +17,13 @@ residuals ask for it.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from chromeball.calibrate.vignette_map import bilinear, smooth
+from chromeball.calibrate.vignette_data import Samples
+from chromeball.calibrate.vignette_map import bilinear, normal, smooth
 from chromeball.scene.errors import UserError
 from chromeball.scene.vignette import (
     LATTICE,
@@ -43,6 +43,8 @@ TERMS, FEWEST, EARNED = 4, 2, 2.0
 #: Prior standard deviations: of a c_k, and of the centre over the radius, about the lens's
 #: principal point and about the middle.
 COEFFICIENT, PRINCIPAL, MIDDLE = 3.0, 0.02, 0.05
+#: Most steps of a fit; the variances of light that hardly varies settle slowly.
+STEPS = 60
 #: Residuals beyond so many robust deviations are outliers.
 OUTLIER = 4.0
 #: The map is asked for when it explains so many standard deviations of chi-square too much,
@@ -50,50 +52,6 @@ OUTLIER = 4.0
 ASKED, WORTH = 6.0, 0.002
 #: r that the samples must reach, and the relative error of V there that is no measurement.
 REACH, WORST = 0.5, 0.05
-#: Least relative error of a place: paper and print, or a panel's grain.
-PAPER = 0.002
-
-
-@dataclass(frozen=True)
-class Picture:
-    """``radiance`` (H, W) linear; ``unusable`` (H, W): saturated, or not valid."""
-
-    name: str
-    radiance: NDArray[np.float32]
-    unusable: NDArray[np.bool_]
-
-
-@dataclass(frozen=True)
-class Samples:
-    """N measurements of light that varies smoothly over each group.
-
-    ``pixels`` (N, 2); ``log`` (N,) ln of the radiance; ``sigma`` (N,) its deviation, up to a
-    common factor; ``group`` (N,) 0 .. G - 1, of one light each; ``cluster`` (N,): what errs
-    together; ``light`` (N, L): what the light may do within a group, in coordinates of about
-    -1 .. 1, with ``kinds`` (L,) that share a variance; ``shared`` (N, M) what it does in all.
-    """
-
-    pixels: Float
-    log: Float
-    sigma: Float
-    group: Index
-    cluster: Index
-    light: Float
-    kinds: tuple[int, ...]
-    shared: Float
-
-    def of(self, chosen: NDArray[np.bool_]) -> Samples:
-        """Some of them, groups and clusters numbered anew."""
-        return replace(
-            self,
-            pixels=self.pixels[chosen],
-            log=self.log[chosen],
-            sigma=self.sigma[chosen],
-            group=np.unique(self.group[chosen], return_inverse=True)[1],
-            cluster=np.unique(self.cluster[chosen], return_inverse=True)[1],
-            light=self.light[chosen],
-            shared=self.shared[chosen],
-        )
 
 
 @dataclass(frozen=True)
@@ -280,12 +238,14 @@ class _Problem:
         if start is not None and count and len(start.x) >= head:
             x[:head] = start.x[:head]
         freedom = 1.0
-        for step in range(60):
+        step = 0
+        while True:
+            step += 1
             value, J = self._model(x, count, nodes)
             y = s.log - value
             w = weight / max(scale, 1e-9) ** 2
             D = np.concatenate([[0.0], 1 / np.maximum(variances[kinds], 1e-12)])
-            A, B, blocks, gx, gl = _normal(J, local, y, w, s.group, groups)
+            A, B, blocks, gx, gl = normal(J, local, y, w, s.group, groups)
             blocks = blocks + np.diag(D)
             # a group that a single sample saw says nothing about its light
             blocks[:, range(L + 1), range(L + 1)] += 1e-9
@@ -320,7 +280,7 @@ class _Problem:
                 calm = calm and bool(np.abs(np.log(new / variances)).max() < 0.02)
             scale *= math.sqrt(ratio)
             variances = new
-            if calm and step > 2:
+            if (calm and step > 3) or step == STEPS:
                 break
         inflation = self._inflation(J, local, through, covariance, residual, w, head)
         condition = float(np.linalg.cond(scaled)) if columns else 1.0
@@ -329,7 +289,7 @@ class _Problem:
         freedom = float(np.trace(told[columns - nodes.shape[1] :, columns - nodes.shape[1] :]))
         return _Fit(
             x,
-            covariance * inflation**2,
+            np.asarray(covariance * inflation**2, float),
             residual,
             variances,
             scale,
@@ -353,14 +313,14 @@ class _Problem:
         centre = self.middle + offset
         nodes = lattice(self.size).reshape(-1, 2)
         grid = fit.x[-len(nodes) :].copy() if mapped else np.zeros(len(nodes))
-        J = self._slopes(nodes, fit.x, count)[1]
+        slopes = self._slopes(nodes, fit.x, count)[1]
         shared = self.samples.shared.shape[1]
-        J = np.concatenate([J, np.zeros((len(nodes), shared))], axis=1)
+        by = np.concatenate([slopes, np.zeros((len(nodes), shared))], axis=1)
         if mapped:  # against the map's own value at the centre: V is 1 there
             at = bilinear(centre[None], self.size)
             grid -= at[0] @ grid
-            J = np.concatenate([J, np.eye(len(nodes)) - at], axis=1)
-        sigma = np.sqrt(np.maximum(np.einsum("nc,cd,nd->n", J, fit.covariance, J), 0))
+            by = np.concatenate([by, np.eye(len(nodes)) - at], axis=1)
+        sigma = np.sqrt(np.maximum(np.einsum("nc,cd,nd->n", by, fit.covariance, by), 0))
         return Vignette(
             self.size,
             (float(centre[0]), float(centre[1])),
@@ -431,35 +391,3 @@ class _Problem:
         told = np.einsum("nc,cd,nd->n", slopes, covariance[:head, :head], slopes)
         said = ((slopes @ step.T) ** 2).sum(axis=1)
         return math.sqrt(max(1.0, float(said.mean() / max(float(told.mean()), 1e-300))))
-
-
-def _normal(
-    J: Float, local: Float, y: Float, w: Float, group: Index, groups: int
-) -> tuple[Float, Float, Float, Float, Float]:
-    """Normal equations of shared columns J (N, c) and local ones (N, l) of each group."""
-    wJ, wl = w[:, None] * J, w[:, None] * local
-    order = np.argsort(group, kind="stable")
-    starts = np.searchsorted(group[order], np.arange(groups))
-    B = np.add.reduceat((wl[:, :, None] * J[:, None, :])[order], starts, axis=0)
-    blocks = np.add.reduceat((wl[:, :, None] * local[:, None, :])[order], starts, axis=0)
-    gl = np.add.reduceat((wl * y[:, None])[order], starts, axis=0)
-    return wJ.T @ J, B, blocks, wJ.T @ y, gl
-
-
-def apertures_agree(apertures: Sequence[float | None]) -> float | None:
-    """The one aperture of all pictures, or None where none is told.
-
-    Raises
-    ------
-    UserError
-        Pictures of several apertures: the fall-off changes with it.
-
-    """
-    told = {a for a in apertures if a is not None and a > 0}
-    if len(told) > 1:
-        listed = ", ".join(f"f/{a:g}" for a in sorted(told))
-        raise UserError(
-            f"pictures of several apertures ({listed}): the fall-off changes with it; "
-            "measure each by itself"
-        )
-    return told.pop() if told else None

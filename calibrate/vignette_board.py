@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chromeball.calibrate.target import Target
-from chromeball.calibrate.vignette import PAPER, Picture, Samples
+from chromeball.calibrate.vignette_data import PAPER, Picture, Samples
 from chromeball.scene.errors import UserError
 
 type Float = NDArray[np.float64]

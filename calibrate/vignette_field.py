@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from chromeball.calibrate.vignette import PAPER, Picture, Samples
+from chromeball.calibrate.vignette_data import PAPER, Picture, Samples
 from chromeball.scene.errors import UserError
 from chromeball.scene.vignette import Edge
 

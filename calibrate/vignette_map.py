@@ -1,4 +1,4 @@
-"""The smooth map of a fall-off: bilinear on a lattice, kept smooth by a prior."""
+"""The smooth map of a fall-off, bilinear and kept smooth by a prior; normal equations."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from chromeball.scene.vignette import LATTICE
 
 type Float = NDArray[np.float64]
+type Index = NDArray[np.intp]
 
 #: Prior deviations of the map's bends and values.
 BEND, VALUE = 0.01, 0.1
@@ -33,3 +34,16 @@ def smooth() -> Float:
     bends.append(math.sqrt(2) * np.diff(np.diff(identity, axis=1), axis=2))
     flat = np.concatenate([b.reshape(rows * columns, -1) for b in bends], axis=1)
     return flat @ flat.T / BEND**2 + np.eye(rows * columns) / VALUE**2
+
+
+def normal(
+    J: Float, local: Float, y: Float, w: Float, group: Index, groups: int
+) -> tuple[Float, Float, Float, Float, Float]:
+    """Normal equations of shared columns J (N, c) and local ones (N, l) of each group."""
+    wJ, wl = w[:, None] * J, w[:, None] * local
+    order = np.argsort(group, kind="stable")
+    starts = np.searchsorted(group[order], np.arange(groups))
+    B = np.add.reduceat((wl[:, :, None] * J[:, None, :])[order], starts, axis=0)
+    blocks = np.add.reduceat((wl[:, :, None] * local[:, None, :])[order], starts, axis=0)
+    gl = np.add.reduceat((wl * y[:, None])[order], starts, axis=0)
+    return wJ.T @ J, B, blocks, wJ.T @ y, gl

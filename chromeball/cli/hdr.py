@@ -337,7 +337,8 @@ def merge(
     from chromeball.hdr.stream import Frames
     from chromeball.scene.image import NEGATIVE_MEANING, write_picture
     from chromeball.scene.raw import no_bayer
-    from chromeball.scene.vignette import REMOVED, file_of, read_known, resolved
+    from chromeball.scene.vignette import REMOVED, resolved
+    from chromeball.scene.vignette_option import file_of, read_known
 
     if output.suffix.lower() != ".exr":
         raise UserError("a radiance map is written as .exr", file=output)

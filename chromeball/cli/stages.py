@@ -30,7 +30,7 @@ from chromeball.scene.manifest import (
     View,
 )
 from chromeball.scene.sequence import at, frames_of, moves
-from chromeball.scene.vignette import file_of
+from chromeball.scene.vignette_option import file_of
 
 # the suffixes of `chromeball.scene.image`, which is too heavy to import for a plan
 RAW_SUFFIXES = frozenset(

@@ -13,8 +13,9 @@ import pytest
 from numpy.typing import NDArray
 
 from chromeball.calibrate.target import Charuco, Chessboard, Target
-from chromeball.calibrate.vignette import Picture, Samples, apertures_agree, solve
+from chromeball.calibrate.vignette import solve
 from chromeball.calibrate.vignette_board import board_samples
+from chromeball.calibrate.vignette_data import Picture, Samples, apertures_agree
 from chromeball.calibrate.vignette_field import check_gradient, flat_samples
 from chromeball.calibrate.virtual import board_poses, project
 from chromeball.cli.main import build_app

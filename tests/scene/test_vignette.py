@@ -13,16 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from chromeball.scene.errors import UserError
-from chromeball.scene.vignette import (
-    LATTICE,
-    Edge,
-    Vignette,
-    lattice,
-    parse_cal,
-    read_given,
-    read_known,
-    read_vignette,
-)
+from chromeball.scene.vignette import LATTICE, Edge, Vignette, lattice, read_vignette
+from chromeball.scene.vignette_option import parse_cal, read_given, read_known
 
 COVARIANCE = np.array([[4e-4, -2e-4], [-2e-4, 3e-4]])
 CAL = """sq(x)=x*x;

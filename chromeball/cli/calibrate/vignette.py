@@ -17,7 +17,8 @@ from chromeball.scene.errors import UserError
 from chromeball.scene.record import Stage, atomic_output, check_output
 
 if TYPE_CHECKING:
-    from chromeball.calibrate.vignette import Picture, Solved
+    from chromeball.calibrate.vignette import Solved
+    from chromeball.calibrate.vignette_data import Picture
     from chromeball.hdr.response_file import Response
 
 type Images = Annotated[list[Path], Parameter(required=True)]
@@ -224,7 +225,7 @@ def _numbers(text: str, count: int) -> list[float]:
 
 
 def _aperture(images: Sequence[Path]) -> float | None:
-    from chromeball.calibrate.vignette import apertures_agree
+    from chromeball.calibrate.vignette_data import apertures_agree
     from chromeball.scene.image import read_exposure
 
     return apertures_agree([read_exposure(path).aperture for path in images])
@@ -252,7 +253,7 @@ def _pictures(files: Sequence[Path], response: Path | None) -> Iterator[Picture]
     """Grey radiance of each file, one at a time."""
     import numpy as np
 
-    from chromeball.calibrate.vignette import Picture
+    from chromeball.calibrate.vignette_data import Picture
     from chromeball.envmap.stitch.frames import read_frame
     from chromeball.scene.vignette import check_once
 

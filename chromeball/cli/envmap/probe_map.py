@@ -17,7 +17,8 @@ from chromeball.cli.envmap.arguments import (
     write_panorama,
 )
 from chromeball.scene.errors import UserError
-from chromeball.scene.vignette import check_once, file_of, read_given
+from chromeball.scene.vignette import check_once
+from chromeball.scene.vignette_option import file_of, read_given
 
 if TYPE_CHECKING:
     from chromeball.envmap.mapping import Mapping

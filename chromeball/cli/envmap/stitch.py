@@ -13,7 +13,7 @@ from chromeball.cli.envmap.arguments import (
 from chromeball.cli.envmap.stitch_map import Bend, Expose, Refine, make_map
 from chromeball.cli.options import Numbers
 from chromeball.scene.errors import UserError
-from chromeball.scene.vignette import file_of
+from chromeball.scene.vignette_option import file_of
 
 if TYPE_CHECKING:
     from chromeball.envmap.stitch.links import Prior

@@ -73,7 +73,8 @@ def make_map(
     from chromeball.envmap.stitch.orient import orient
     from chromeball.envmap.stitch.photometric import optics, solve, unchanged
     from chromeball.scene.record import Stage, check_output, write_json
-    from chromeball.scene.vignette import check_once, read_given, resolved
+    from chromeball.scene.vignette import check_once, resolved
+    from chromeball.scene.vignette_option import read_given
 
     names = [path.stem for path in files]
     if len(files) < 2:

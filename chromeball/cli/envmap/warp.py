@@ -109,7 +109,8 @@ def warp(
     from chromeball.envmap.probe import rotation, vignetting_gain
     from chromeball.envmap.resample import Warping, marking
     from chromeball.scene.record import Stage, check_output
-    from chromeball.scene.vignette import REMOVED, check_once, file_of, read_given
+    from chromeball.scene.vignette import REMOVED, check_once
+    from chromeball.scene.vignette_option import file_of, read_given
 
     angles = parse_numbers(rotate, "--rotate", 3) if rotate is not None else [0.0, 0.0, 0.0]
     if width is not None and not 1 <= width <= 65536:
