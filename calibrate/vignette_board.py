@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from chromeball.calibrate.target import Target
+from chromeball.calibrate.aprilgrid import AprilGrid
+from chromeball.calibrate.target import CircleGrid, Target
 from chromeball.calibrate.vignette_data import PAPER, Picture, Samples
 from chromeball.scene.errors import UserError
 
@@ -32,6 +33,23 @@ class Counted:
     saturated: int
 
 
+def check_target(target: Target) -> None:
+    """Refuse a target whose squares of four neighbouring corners are not whole.
+
+    Raises
+    ------
+    UserError
+        For AprilGrids and asymmetric grids of circles.
+
+    """
+    if isinstance(target, AprilGrid) or (isinstance(target, CircleGrid) and target.asymmetric):
+        raise UserError(
+            f"{target.spec}: white is measured between the corners of a chessboard, a ChArUco "
+            "board or a symmetric grid of circles: photograph one of these, or use "
+            "`calibrate vignette flat`"
+        )
+
+
 def board_samples(
     pictures: Iterable[Picture],
     corners: Sequence[Float],
@@ -46,9 +64,11 @@ def board_samples(
     Raises
     ------
     UserError
-        When white is saturated in most squares, or no square is large enough.
+        When white is saturated in most squares, no square is large enough, or the target is
+        of another kind, :func:`check_target`.
 
     """
+    check_target(target)
     white = _whiteness(target)
     kept: list[tuple[str, Float]] = []
     saturated = found = 0

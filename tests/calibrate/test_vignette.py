@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from chromeball.calibrate.target import Charuco, Chessboard, Target
+from chromeball.calibrate.target import Charuco, Chessboard, Target, parse_target
 from chromeball.calibrate.vignette import solve
 from chromeball.calibrate.vignette_board import board_samples
 from chromeball.calibrate.vignette_data import Picture, Samples, apertures_agree
@@ -217,6 +217,9 @@ def test_refusals() -> None:
     bright = [np.where(c > 120, 255, c).astype(np.uint8) for c in views(BOARD, 4, 1, 0.0)]
     with pytest.raises(UserError, match=r"white is saturated in \d+ of"):
         measured(bright, BOARD, 1)
+    for spec in ("aprilgrid:6x6:0.088:0.3", "acircles:4x11:0.02"):
+        with pytest.raises(UserError, match="symmetric grid of circles"):
+            board_samples([], [], parse_target(spec), [])
     assert apertures_agree([5.6, None, 5.6]) == 5.6
     with pytest.raises(UserError, match="several apertures"):
         apertures_agree([5.6, 8.0])

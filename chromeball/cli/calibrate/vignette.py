@@ -51,7 +51,7 @@ def board(
     images
         Photographs of the board at one aperture, focus and zoom; RAW or EXR, or codes.
     target
-        As `calibrate lens` takes it.
+        A chessboard, ChArUco board or symmetric grid of circles, as `calibrate lens` takes it.
     camera
         The lens: its principal point says about where the fall-off has its centre.
     response
@@ -67,9 +67,10 @@ def board(
     from chromeball.calibrate.detect import Detection, detect_files
     from chromeball.calibrate.target import parse_target
     from chromeball.calibrate.vignette import solve
-    from chromeball.calibrate.vignette_board import board_samples
+    from chromeball.calibrate.vignette_board import board_samples, check_target
 
     sheet = parse_target(target)
+    check_target(sheet)
     others = [path for path in (camera, response) if path is not None]
     check_output(output, [*images, *others], ".json")
     with Stage("calibrate vignette board", [*images, *others], target=target) as stage:
