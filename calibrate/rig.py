@@ -20,7 +20,14 @@ from chromeball.calibrate import rig_solve
 from chromeball.calibrate.lens_result import check_focal
 from chromeball.calibrate.rig_lenses import Alone, calibrate_alone, place_alone
 from chromeball.calibrate.rig_solve import Layout, RigEstimate
-from chromeball.calibrate.rig_start import disconnected, groups, readings, start_rig
+from chromeball.calibrate.rig_start import (
+    AGREES,
+    MOVED,
+    disconnected,
+    groups,
+    readings,
+    start_rig,
+)
 from chromeball.calibrate.rig_sync import Sync, synchronise
 from chromeball.calibrate.target import Target
 from chromeball.scene.camera import CameraModel
@@ -161,7 +168,8 @@ def calibrate_rig(
     saw = np.array([a.saw for a in alone])
     poses = np.array([a.camera_from_board for a in alone])
     cameras = [_open(a.camera) for a in alone]
-    start = start_rig(names, cameras, poses, saw, target)
+    agrees = AGREES if stamps is None else MOVED
+    start = start_rig(names, cameras, poses, saw, target, agrees)
     corners = np.where(saw[..., None, None, None], corners, np.nan)
     corners = _reread(corners, start.turned, target)
 

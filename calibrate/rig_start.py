@@ -23,8 +23,9 @@ from chromeball.scene.camera import CameraModel
 from chromeball.scene.errors import UserError
 from chromeball.scene.pose import Pose
 
-#: Boards placed by two cameras agree within this share of their distance.
-AGREES = 0.06
+#: Boards placed by two cameras agree within this share of their distance, and boards that may
+#: have moved between the two.
+AGREES, MOVED = 0.06, 0.2
 #: Of three or more boards seen at once so many must agree, else the pair is not trusted.
 LEAST_AGREEING = 0.3
 
@@ -133,8 +134,11 @@ def start_rig(
     camera_from_board: Matrix,
     seen: NDArray[np.bool_],
     target: Target,
+    agrees: float = AGREES,
 ) -> Start:
     """A rig from boards (C, F, 4, 4) placed by each camera alone, where `seen` (C, F).
+
+    Two cameras agree on a board that both place within so much of its distance.
 
     Raises
     ------
@@ -154,7 +158,7 @@ def start_rig(
         if not len(both):
             continue
         relative, agree = _relative(
-            camera_from_board[a, both], camera_from_board[b, both], motions, board
+            camera_from_board[a, both], camera_from_board[b, both], motions, board, agrees
         )
         if agree >= max(1, LEAST_AGREEING * len(both)):
             agreeing[a, b] = agreeing[b, a] = agree
@@ -168,7 +172,7 @@ def start_rig(
             first, second = camera_from_board[a, both], camera_from_board[b, both]
             mirrored = _mirrored(second, target)
             text += f"; {names[a]} and {names[b]} see {len(both)} boards at once, but "
-            if _relative(first, mirrored, motions, board)[1] > 0.5 * len(both) > 1:
+            if _relative(first, mirrored, motions, board, agrees)[1] > 0.5 * len(both) > 1:
                 text += "the pictures of one of them are mirrored"
             else:
                 text += (
@@ -207,7 +211,7 @@ def _misfits(
 
 
 def _relative(
-    first: Matrix, second: Matrix, motions: Matrix, board: Matrix
+    first: Matrix, second: Matrix, motions: Matrix, board: Matrix, agrees: float
 ) -> tuple[Matrix, int]:
     """first_from_second that boards (V, 4, 4) seen by both agree on best, and how many do."""
     candidates = first[:, None] @ np.linalg.inv(second[:, None] @ motions)
@@ -216,8 +220,8 @@ def _relative(
         candidates = candidates[:: len(candidates) // 200]
     misfit = _misfits(candidates, first, second, motions, board).min(axis=-1)
     # Ties, as of a single instant, go to the reading as it was made.
-    best = int(np.argmin(np.round(np.minimum(misfit, 2 * AGREES).mean(axis=1), 12)))
-    return candidates[best], int((misfit[best] < AGREES).sum())
+    best = int(np.argmin(np.round(np.minimum(misfit, 2 * agrees).mean(axis=1), 12)))
+    return candidates[best], int((misfit[best] < agrees).sum())
 
 
 def _spanning_tree(pairs: dict[tuple[int, int], Matrix], agreeing: NDArray[np.intp]) -> Matrix:
