@@ -223,7 +223,7 @@ def calibrate_rig(
             if chosen.any():
                 lenses[c] = everything[np.ix_(layout.lens[c], layout.lens[c])]
                 values, spread = estimate.cameras[c].intrinsics, np.sqrt(np.diag(lenses[c]))
-                _named(names[c], check_focal, values, spread, 2 if len(values) > 3 else 1)
+                _check_lens(names[c], values, spread, ratio)
         error = rig_solve.residuals(estimate, board, corners)
         error[~used] = np.nan
     _check_connected(error, names)
@@ -299,6 +299,23 @@ def _named[T](name: str, function: Callable[..., T], *arguments: Any) -> T:
         return function(*arguments)
     except UserError as error:
         raise UserError(f"camera {name}: {error.what}") from error
+
+
+def _check_lens(
+    name: str, intrinsics: NDArray[np.float64], spread: NDArray[np.float64], ratio: float
+) -> None:
+    """Refuse a lens left open; where the cameras disagree, that is why."""
+    try:
+        check_focal(intrinsics, spread, 2 if len(intrinsics) > 3 else 1)
+    except UserError as error:
+        why = error.what
+        if ratio > DISAGREEMENT:
+            why = (
+                f"together the cameras are {ratio:.0f} times less exact than each alone, and "
+                "leave its lens open: pair the pictures rightly, hold the board still while "
+                "they look, or give --times"
+            )
+        raise UserError(f"camera {name}: {why}") from error
 
 
 def _open(camera: CameraModel) -> CameraModel:
