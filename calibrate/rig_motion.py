@@ -49,7 +49,8 @@ class Motion:
     def begin(cls, rig: RigEstimate, stamps: Array, seen: NDArray[np.bool_]) -> Motion:
         """From a rig solved as if all looked at once, and which frames (C, F) saw the board."""
         instants = np.full(stamps.shape[1], np.nan)
-        placed = seen.any(axis=0)
+        placed, timed = seen.any(axis=0), np.isfinite(stamps).any(axis=0)
+        instants[timed] = np.nanmean(stamps[:, timed], axis=0)
         instants[placed] = np.nanmean(np.where(seen, stamps, np.nan)[:, placed], axis=0)
         base = np.tile(np.arange(len(instants)), (len(stamps), 1))
         before, after = _neighbours(instants, placed)
@@ -59,13 +60,21 @@ class Motion:
     def rebased(self, seen: NDArray[np.bool_]) -> Motion:
         """Each frame that saw the board (C, F) told from the instant nearest to it now."""
         moments = self.stamps + self.offsets[:, None]
-        placed = np.flatnonzero(np.isfinite(self.instants))
+        timed = np.flatnonzero(np.isfinite(self.instants))
         base = self.base.copy()
-        far = np.abs(moments[seen][:, None] - self.instants[placed])
-        base[seen] = placed[far.argmin(axis=1)]
+        far = np.abs(moments[seen][:, None] - self.instants[timed])
+        base[seen] = timed[far.argmin(axis=1)]
+        # An instant that no frame had been told from begins with the board of one that is now.
+        rotations = self.rig.board_rotations.copy()
+        translations = self.rig.board_translations.copy()
+        known = set(self.base[seen].tolist())
+        for old, new in zip(self.base[seen].tolist(), base[seen].tolist(), strict=True):
+            if new not in known:
+                rotations[new], translations[new] = rotations[old], translations[old]
         used = np.isin(np.arange(len(self.instants)), base[seen])
         before, after = _neighbours(self.instants, used)
-        return replace(self, base=base, before=before, after=after)
+        rig = replace(self.rig, board_rotations=rotations, board_translations=translations)
+        return replace(self, rig=rig, base=base, before=before, after=after)
 
 
 def _neighbours(

@@ -203,6 +203,7 @@ def test_clocks(readout: float) -> None:
                 corners[c, v, r, k] = FAN[c].project(point)
             row = (corners[c, v, ..., 1] + 0.5) / SIZE[1] - 0.5
     corners += np.random.default_rng(1).normal(0, 0.1, corners.shape)
+    corners[[0, 2], :3] = np.nan  # one camera alone tells how the board began to move
     known = dict(zip(NAMES, FAN, strict=False))
     rig = solve(corners, board, known=known, stamps=stamps)
     assert rig.sync is not None
