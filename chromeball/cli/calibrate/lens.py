@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from chromeball.cli.calibrate.arguments import Json, Out, say
+from chromeball.cli.calibrate.arguments import Json, Out, print_figures, say
 from chromeball.scene.errors import UserError
-from chromeball.scene.record import Stage, check_output
+from chromeball.scene.record import Stage, check_output, record_path
 
 
 def lens(
@@ -16,6 +16,9 @@ def lens(
     target: str,
     output: Out,
     model: str = "opencv8",
+    watch: Path | None = None,
+    views: int | None = None,
+    reuse: Path | None = None,
     json: Json = False,
 ) -> None:
     """Calibrate one lens from pictures of a target.
@@ -40,6 +43,15 @@ def lens(
         (Kannala and Brandt), kb4_decentred (with elements off the axis), equidistant,
         equisolid, stereographic; or auto: the simplest that predicts pictures left out of the
         solution as well as any.
+    watch
+        Instead of pictures a folder into which they come: each is looked at when it is whole,
+        and verdict and advice are told again. Ends with Ctrl-C, after so many views, or when
+        the verdict is good; then the camera is written. With auto, kb4 stands in until then.
+    views
+        With --watch: so many views are enough.
+    reuse
+        A camera calibrated earlier: kept when metadata and the new pictures agree with it, one
+        tilted view of the board suffices; else it is solved again, and why is said.
     output
         The .cameramodel to write, in mrcal's format, with the covariance of the intrinsics; for
         mrcal's models, the first five, with all that the solution was made of.
@@ -50,22 +62,43 @@ def lens(
     from chromeball.calibrate.detect import Detection, detect_files
     from chromeball.calibrate.lens import MODELS
     from chromeball.calibrate.target import parse_target
-    from chromeball.cli.calibrate.solved import solve_and_tell
+    from chromeball.calibrate.watch import watch_lens
+    from chromeball.cli.calibrate.kept import keep_camera
+    from chromeball.cli.calibrate.solved import solve_and_tell, tell_progress
 
     board = parse_target(target)
-    if not images:
-        raise UserError("name the pictures of the target")
+    if bool(images) == (watch is not None):
+        raise UserError("name the pictures of the target, or a folder to --watch")
+    if views is not None and (watch is None or views < 1):
+        raise UserError("--views N goes with --watch, and is 1 or more")
+    if reuse is not None and watch is not None:
+        raise UserError("--reuse checks pictures that are there: leave --watch out")
     if model not in MODELS:
         raise UserError(f"unknown lens model {model!r}; one of {', '.join(MODELS)}")
     if output.suffix != ".cameramodel":
         raise UserError("a camera model's name ends in .cameramodel", file=output)
-    check_output(output, images)
-    stage = Stage("calibrate lens", images, target=target, model=model)
+    inputs = [*images, *([] if reuse is None else [reuse, record_path(reuse)])]
+    check_output(output, inputs)
+    stage = Stage("calibrate lens", inputs, target=target, model=model)
 
     def tell(detection: Detection) -> None:
         say(f"{detection.file}: {detection.verdict}")
 
     with stage:
-        detections = detect_files(images, board, tell)
+        if watch is not None:
+            stand_in = "kb4" if model == "auto" else model
+            detections = watch_lens(watch, board, stand_in, tell_progress, enough=views)
+            if not any(d.usable for d in detections):
+                raise UserError("no picture of the board came", file=watch)
+            stage.inputs = [d.file for d in detections]
+            check_output(output, stage.inputs)
+        else:
+            detections = detect_files(images, board, tell)
+        if reuse is not None and keep_camera(stage, detections, board, reuse, output):
+            if json:
+                print_figures(stage.figures)
+            else:
+                print(f"{output}: {stage.figures['verdict']}")
+            return
         print_out = solve_and_tell(stage, detections, board, model, output)
     print_out(json)

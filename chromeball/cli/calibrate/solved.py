@@ -24,10 +24,12 @@ from chromeball.calibrate.plots import (
     plot_verdict,
     plot_worst,
 )
+from chromeball.calibrate.reuse import taken_with
 from chromeball.calibrate.solve import fit_start
 from chromeball.calibrate.target import Target
 from chromeball.calibrate.verdict import Verdict, judge_lens
 from chromeball.calibrate.views import repeated_views, spread_views
+from chromeball.calibrate.watch import Progress
 from chromeball.cli.calibrate.arguments import print_figures, say
 from chromeball.scene.errors import UserError
 from chromeball.scene.image import read_image
@@ -67,6 +69,7 @@ def solve_and_tell(
         "skipped": [str(d.file) for d in detections if not d.usable],
         "repeated": [str(d.file) for d in dropped],
         "chosen_model": chosen,
+        "taken_with": taken_with(files),
         "view_rms": dict(zip(files, lens.view_rms, strict=True)),
     }
     drawings: dict[str, Callable[[Path], None]] = {
@@ -90,6 +93,17 @@ def solve_and_tell(
         lens.write(temporary)
     title = f"{output}: {chosen}, {len(used)} of {len(detections)} pictures"
     return lambda json: print_figures(stage.figures) if json else _print(title, lens, verdict)
+
+
+def tell_progress(progress: Progress) -> None:
+    """What one more picture brings, while pictures arrive."""
+    say(f"{progress.detection.file}: {progress.detection.verdict}")
+    if progress.verdict is None:
+        say(f"  {progress.views} views: {progress.reason}")
+        return
+    say(f"  {progress.views} views: {progress.verdict.sentence}")
+    for line in progress.verdict.advice:
+        say(f"  - {line}")
 
 
 def telling_views(detections: Sequence[Detection]) -> tuple[list[Detection], list[Detection]]:
