@@ -1,10 +1,11 @@
 """Whether a camera calibrated earlier still is the one that took new pictures of the target.
 
-The residuals of the new views, their poses fitted, are compared with those of the views that it
-was solved from: a ratio of mean squares, which follows Fisher's law if nothing has changed. Real
-residuals scatter more from view to view than independent noise would; the degrees of freedom are
-those that the old views' scatter shows (Satterthwaite 1946). The lens's own uncertainty is not
-counted: a lens of few views is solved again rather than kept.
+Two tests, each with half of the stated risk. The residuals of the new views, their poses
+fitted, against those of the views that the camera was solved from: a ratio of mean squares,
+which follows Fisher's law if nothing has changed. And the change of the focal length that
+explains the new residuals best, in its standard errors. Real residuals scatter more from view to view than
+independent noise would; the degrees of freedom are those that the old views' scatter shows
+(Satterthwaite 1946).
 """
 
 from __future__ import annotations
@@ -25,9 +26,11 @@ from chromeball.scene.image import positive, read_header
 
 #: Risk of solving again although nothing has changed.
 RISK = 0.01
-#: A change of the focal length that the new views must be able to show, relative: one of this
-#: size moves the corners of a picture 1000 px wide by 2.5 px.
-VISIBLE = 0.005
+#: A change of the focal length that the new views must be able to show, relative, nine times in
+#: ten: a lens that was taken off, zoomed or refocused from near to far changes by more.
+VISIBLE, POWER = 0.01, 0.9
+#: For its derivative.
+STEP = 1e-3
 #: Corners farther off than this many times the median do not count, up to this share of them.
 GROSS, GROSS_SHARE = 6.0, 0.1
 #: What metadata may say of the pictures: name -> words and relative tolerance.
@@ -77,6 +80,7 @@ def check_reuse(
     if size != camera.size:
         return _no("the pictures are {}x{}, the camera's {}x{}".format(*size, *camera.size))
     from scipy.stats import f as fisher
+    from scipy.stats import norm as normal
 
     before = figures.get("taken_with") or {}
     for name, (words, tolerance) in FACTS.items():
@@ -103,20 +107,32 @@ def check_reuse(
     spread = float(np.var(old**2, ddof=1) / np.mean(old**2) ** 2)
     each = min(dof / len(corners), 2 / max(spread, 1e-9))
     ratio = square / expected
-    limit = float(fisher.ppf(1 - RISK, each * len(corners), each * len(old)))
-    shows = _visible(camera, corners + left, target, bow, pupil, (limit - 1) * expected)
+    limit = float(fisher.ppf(1 - RISK / 2, each * len(corners), each * len(old)))
+    change, error = _focal_change(camera, corners, left, target, bow, pupil)
+    error *= float(sigma) * math.sqrt(dof / len(corners) / each)
+    error = math.hypot(error, _known_focal(figures))
+    most = float(normal.ppf(1 - RISK / 4))
+    shows = (most + float(normal.ppf(POWER))) * error
     told: dict[str, Any] = {
         "views": len(corners),
         "rms_ratio": math.sqrt(ratio),
         "rms_ratio_limit": math.sqrt(limit),
-        "risk": RISK,
+        "focal_change": change,
+        "focal_change_error": error,
         "focal_change_visible": shows,
+        "risk": RISK,
         "view_rms": errors,
     }
     if ratio > limit:
         return _no(
-            f"the new views miss it by {math.sqrt(ratio):.2f} times the old residuals, more than "
-            f"chance allows ({math.sqrt(limit):.2f})",
+            f"the new views miss it by {math.sqrt(ratio):.2f} times the old residuals, more "
+            f"than chance allows ({math.sqrt(limit):.2f})",
+            **told,
+        )
+    if abs(change) > most * error:
+        by = f"{100 * abs(change):.2f} % {'longer' if change > 0 else 'shorter'}"
+        return _no(
+            f"the new views fit a focal length {by}, {abs(change) / error:.1f} standard errors",
             **told,
         )
     if shows > VISIBLE:
@@ -128,7 +144,8 @@ def check_reuse(
     return Check(
         True,
         f"the new views fit it with {math.sqrt(ratio):.2f} times the old residuals (limit "
-        f"{math.sqrt(limit):.2f}); a focal length changed by {100 * shows:.2f} % would have shown",
+        f"{math.sqrt(limit):.2f}); a focal length changed by {100 * shows:.1g} % would have "
+        "shown",
         told,
     )
 
@@ -144,23 +161,34 @@ def _without_gross(
     return np.where(gross[..., None], np.nan, corners)
 
 
-def _visible(
+def _focal_change(
     camera: CameraModel,
-    ideal: NDArray[np.float64],
+    corners: NDArray[np.float64],
+    left: NDArray[np.float64],
     target: Target,
     bow: NDArray[np.float64] | None,
     pupil: NDArray[np.float64],
-    excess: float,
-) -> float:
-    """The relative change of the focal length that adds `excess` square pixels to residuals.
+) -> tuple[float, float]:
+    """The relative change of the focal length that lowers the residuals `left` most.
 
-    `ideal` corners are where the camera sees them; residuals grow as the change does.
+    With it its standard error for corners of deviation 1 pixel. The poses follow the change:
+    the derivative is that of refitted residuals.
     """
     values = camera.intrinsics.copy()
-    values[: 2 if len(values) > 3 else 1] *= 1 + VISIBLE
+    values[: 2 if len(values) > 3 else 1] *= 1 + STEP
     changed = replace(camera, intrinsics=values)
-    moved = pose_residuals(changed, ideal, target, bow, pupil)
-    return VISIBLE * math.sqrt(excess / max(float(np.nansum(moved**2)), 1e-30))
+    slope = (pose_residuals(changed, corners, target, bow, pupil) - left) / STEP
+    both = np.isfinite(slope) & np.isfinite(left)
+    square = max(float((slope[both] ** 2).sum()), 1e-30)
+    return -float((slope[both] * left[both]).sum()) / square, 1 / math.sqrt(square)
+
+
+def _known_focal(figures: Mapping[str, Any]) -> float:
+    """Relative standard error of the focal length in a record."""
+    for name in ("fx", "f"):
+        if name in figures["intrinsics"]:
+            return float(figures["standard_errors"][name] / figures["intrinsics"][name])
+    return 0.0
 
 
 def _facts(attributes: Mapping[str, Any]) -> dict[str, str | float]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +21,10 @@ from chromeball.scene.errors import UserError
 from chromeball.scene.image import read_image
 
 PICTURES = frozenset(
-    ".png .jpg .jpeg .tif .tiff .bmp .exr .dng .cr2 .cr3 .nef .arw .raf .rw2 .orf".split()
+    (
+        *(".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".exr", ".dng"),
+        *(".cr2", ".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf"),
+    )
 )
 #: Seconds between two looks; a file that did not change between them is read.
 PAUSE = 0.5
@@ -110,7 +113,9 @@ def watch_lens(
         for path, error in arriving(folder, pause=pause, patience=patience):
             if error is not None:
                 empty = np.full((target.rows, target.columns, 2), np.nan)
-                failed = Detection(path, (0, 0), empty, float("nan"), False, error.what)
+                failed = Detection(
+                    path, (0, 0), empty, empty[..., 0], float("nan"), False, error.what
+                )
                 tell(Progress(failed, len(_counting(detections)), None, "not a picture"))
                 continue
             picture = grey(read_image(path))
@@ -118,9 +123,7 @@ def watch_lens(
             first = next(iter(detections.values()), detection)
             if detection.size != first.size:
                 wrong = "{}x{}, not {}x{}: left out".format(*detection.size, *first.size)
-                failed = Detection(
-                    path, detection.size, detection.corners, float("nan"), False, wrong
-                )
+                failed = replace(detection, usable=False, verdict=wrong)
                 tell(Progress(failed, len(_counting(detections)), None, "another size"))
                 continue
             detections[path] = detection

@@ -55,21 +55,23 @@ def checked(
 
 
 def test_an_unchanged_camera_is_kept() -> None:
-    """At a risk of one in a hundred: of 60 single views at most 3 are refused for misfit."""
+    """At a risk of one in a hundred: of 60 single views at most 3 are refused as changed."""
     checks = [checked(CAMERA, seed) for seed in range(60)]
-    missed = [c for c in checks if not c.kept and "miss it" in c.reason]
+    missed = [c for c in checks if not c.kept and "would not show" not in c.reason]
     assert len(missed) <= 3
-    assert sum(c.kept for c in checks) > 30
+    assert sum(c.kept for c in checks) > 20
+    scores = [c.figures["focal_change"] / c.figures["focal_change_error"] for c in checks]
+    assert 0.7 < np.sqrt(np.mean(np.square(scores))) < 1.3
     assert checked(CAMERA, views=4).kept
 
 
 def test_changes_show() -> None:
-    for by in (1.015, 0.985):
+    for by in (1.01, 0.99):
         values = CAMERA.intrinsics.copy()
         values[:2] *= by
         check = checked(replace(CAMERA, intrinsics=values), views=3)
         assert not check.kept
-        assert "miss it by" in check.reason
+        assert "miss it by" in check.reason or "standard errors" in check.reason
 
 
 def test_a_frontal_view_does_not_do() -> None:
@@ -124,6 +126,6 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     for i, pose in enumerate(poses):
         write_picture(files[i], photograph(board, zoomed, pose, seed=i))
     run(*files, *options, "--reuse", first, "-o", second)
-    assert "is not kept: the new views miss it by" in capsys.readouterr().err
+    assert "is not kept: the new views" in capsys.readouterr().err
     again = CameraModel.read(second)
     assert again.intrinsics[0] == pytest.approx(zoomed.intrinsics[0], abs=2)
