@@ -3,9 +3,9 @@
 Two tests, each with half of the stated risk. The residuals of the new views, their poses
 fitted, against those of the views that the camera was solved from: a ratio of mean squares,
 which follows Fisher's law if nothing has changed. And the change of the focal length that
-explains the new residuals best, in its standard errors. Real residuals scatter more from view to
-view than independent noise would; the degrees of freedom are those that the old views' scatter
-shows (Satterthwaite 1946).
+explains the new residuals best, in its standard errors. Real residuals scatter more from view
+to view than independent noise would; the degrees of freedom are those that the old views'
+scatter shows (Satterthwaite 1946).
 """
 
 from __future__ import annotations
