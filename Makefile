@@ -66,7 +66,7 @@ office: $(READY)
 	@PATH="$(CURDIR)/.venv/bin:$$PATH" $(MAKE) --no-print-directory -C office
 
 test: $(READY)
-	$(RUN)pytest
+	$(RUN)pytest -n 2 --dist worksteal --benchmark-disable
 
 lint: $(READY)
 	$(RUN)ruff check .
