@@ -18,14 +18,11 @@ from numpy.typing import NDArray
 from chromeball.calibrate.aprilgrid import AprilGrid, Code
 from chromeball.calibrate.grow import Found, grow
 from chromeball.calibrate.markers import Markers, consistent, read_markers
-from chromeball.calibrate.patch import Board
+from chromeball.calibrate.printed import Printed, board_of
 from chromeball.calibrate.target import Charuco
 
 #: Larger pictures are searched at this width first; corners are always fitted at full size.
 SEARCH_WIDTH = 1600
-#: Half of the window of patches in squares: all of it on the four squares about the corner, or
-#: up to the width of the joints between tags.
-REACH = 0.45
 #: A marker alone is believed when its code is as clear as this, several when they agree.
 CLEAR = 0.9
 #: Fewest corners that show that the board is there.
@@ -34,26 +31,27 @@ FEWEST = 4
 type Coded = Charuco | AprilGrid
 
 
-def find_coded(picture: NDArray[np.uint8], target: Coded) -> Found:
-    """Corners of `target` in the order of its points, (rows * columns, 2)."""
+def find_coded(picture: NDArray[np.uint8], target: Coded) -> tuple[Found, Printed]:
+    """Corners of `target` in the order of its points, and how it was printed."""
     places = target.points()[..., :2].reshape(-1, 2) / target.square
-    inverse = np.asarray(255 - picture, np.uint8)
-    for shown, rest in ((picture, True), (inverse, False)):
-        for kind, markers in _boards(shown, target, thorough=rest):
+    for inverted in (False, True):
+        shown = np.asarray(255 - picture, np.uint8) if inverted else picture
+        for kind, markers in _boards(shown, target, thorough=not inverted):
             known = kind.outlines()[markers.numbers].reshape(-1, 2)
             sides = np.linalg.norm(np.diff(markers.outlines, axis=1), axis=-1).mean()
-            board = _board(kind, float(sides) / _side(kind))
-            found = grow(shown, board, places, known, markers.outlines.reshape(-1, 2))
+            printed = Printed(kind, inverted)
+            board = board_of(printed, float(sides) / _side(kind))
+            found = grow(picture, board, places, known, markers.outlines.reshape(-1, 2))
             if np.isfinite(found.sigma).sum() >= FEWEST:
-                return found
+                return found, printed
     empty = np.full((len(places), 2), np.nan)
-    return Found(empty, empty[:, 0], np.nan)
+    return Found(empty, empty[:, 0], np.nan), Printed(target, False)
 
 
 def is_mirrored(picture: NDArray[np.uint8], target: Coded) -> bool:
     """Whether the board can be read in a mirror."""
     mirrored = np.ascontiguousarray(picture[:, ::-1])
-    return bool(np.isfinite(find_coded(mirrored, target).sigma).any())
+    return bool(np.isfinite(find_coded(mirrored, target)[0].sigma).any())
 
 
 def read_board(
@@ -105,16 +103,6 @@ def _others(target: Coded) -> list[Coded]:
 def _side(target: Coded) -> float:
     """A marker's side in squares."""
     return 1.0 if isinstance(target, AprilGrid) else target.marker / target.square
-
-
-def _board(target: Coded, pitch: float) -> Board:
-    reach = min(REACH, target.spacing) if isinstance(target, AprilGrid) else REACH
-    return Board.of(_cells(target), target.cells_per_square, reach, pitch)
-
-
-@cache
-def _cells(target: Coded) -> NDArray[np.uint8]:
-    return target.cells()
 
 
 @cache

@@ -9,9 +9,12 @@ centroids (:mod:`chromeball.calibrate.circles`).
 
 from __future__ import annotations
 
+import multiprocessing
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +22,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from chromeball.calibrate import detect_cache
 from chromeball.calibrate.aprilgrid import AprilGrid
 from chromeball.calibrate.circles import detect_circles
-from chromeball.calibrate.coded import REACH, find_coded, is_mirrored
-from chromeball.calibrate.grow import Found, grow, likeness
-from chromeball.calibrate.patch import Board
+from chromeball.calibrate.coded import find_coded, is_mirrored
+from chromeball.calibrate.detection import Detection
+from chromeball.calibrate.grow import Found, likeness, refit
+from chromeball.calibrate.printed import Printed, board_of
 from chromeball.calibrate.target import Charuco, Chessboard, CircleGrid, Target
 from chromeball.scene.errors import UserError
 from chromeball.scene.image import Image, read_image, to_display
@@ -34,39 +39,22 @@ WINDOW = 0.30
 FEWEST = 8
 #: Larger pictures are searched at this width first; refinement is always at full size.
 SEARCH_WIDTH = 1600
-
-
-@dataclass(frozen=True)
-class Detection:
-    """What one picture shows of the target.
-
-    ``corners`` is (rows, columns, 2) in pixels, NaN where not found; ``sigma`` (rows, columns)
-    the standard error of a coordinate from the picture's noise, NaN where it is not known;
-    ``size`` is width and height; ``blur`` the standard deviation of the edges' spread in
-    pixels, NaN without a board; ``usable`` says that the view may enter a calibration,
-    ``verdict`` why or why not.
-    """
-
-    file: Path
-    size: tuple[int, int]
-    corners: NDArray[np.float64]
-    sigma: NDArray[np.float64]
-    blur: float
-    usable: bool
-    verdict: str
-
-    @property
-    def count(self) -> int:
-        """How many corners were found."""
-        return int(np.isfinite(self.corners[..., 0]).sum())
+#: Pictures for each further process that are worth its start.
+WORTH = 4
 
 
 def detect_files(
     files: Sequence[str | os.PathLike[str]],
     target: Target,
     progress: Callable[[Detection], object] | None = None,
+    *,
+    workers: int = 1,
+    cache: Path | None = None,
 ) -> list[Detection]:
-    """Look for `target` in every picture; `progress` hears of each.
+    """Look for `target` in every picture; `progress` hears of each, in their order.
+
+    Up to `workers` processes share the pictures. Detections are kept in the folder `cache`, if
+    it is given, and pictures known there are not searched again.
 
     Raises
     ------
@@ -75,16 +63,14 @@ def detect_files(
 
     """
     detections: list[Detection] = []
-    for file in files:
-        image = read_image(file)
-        if detections and image.size != detections[0].size:
+    for detection in _detections([Path(f) for f in files], target, workers, cache):
+        if detections and detection.size != detections[0].size:
             raise UserError(
                 "this picture is {}x{}, {} is {}x{}: pictures of one lens have one size".format(
-                    *image.size, detections[0].file, *detections[0].size
+                    *detection.size, detections[0].file, *detections[0].size
                 ),
-                file=file,
+                file=detection.file,
             )
-        detection = judge(Path(file), grey(image), target)
         detections.append(detection)
         if progress is not None:
             progress(detection)
@@ -99,13 +85,51 @@ def detect_files(
     return detections
 
 
+def _detections(
+    files: list[Path], target: Target, workers: int, cache: Path | None
+) -> Iterator[Detection]:
+    """Of each file in turn."""
+    search = partial(_detection, target=target, cache=cache)
+    processes = min(workers, len(files) // WORTH)
+    if processes < 2:
+        yield from map(search, files)
+        return
+    # Not forked: what runs in threads here, as OpenCV and JAX do, would hang in the copy.
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(processes, context, _one_thread) as pool:
+        try:
+            yield from pool.map(search, files)
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def _one_thread() -> None:
+    """Every process has a core to itself."""
+    cv2.setNumThreads(1)
+
+
+def _detection(file: Path, target: Target, cache: Path | None) -> Detection:
+    kept: Path | None = None
+    if cache is not None and file.is_file():
+        kept = detect_cache.entry(cache, file, target)
+        known = detect_cache.load(kept, file)
+        if known is not None:
+            return known
+    detection = judge(file, grey(read_image(file)), target)
+    if kept is not None:
+        detect_cache.store(kept, detection)
+    return detection
+
+
 def judge(file: Path, picture: NDArray[np.uint8], target: Target) -> Detection:
     """Detect in one grey picture and say what came of it."""
     size = (picture.shape[1], picture.shape[0])
     seen = look(picture, target)
 
     def verdict(usable: bool, text: str) -> Detection:
-        return Detection(file, size, seen.corners, seen.sigma, seen.blur, usable, text)
+        return Detection(
+            file, size, seen.corners, seen.sigma, seen.blur, usable, text, seen.printed
+        )
 
     found = np.argwhere(np.isfinite(seen.corners[..., 0]))
     if not len(found):
@@ -137,13 +161,14 @@ def grey(image: Image) -> NDArray[np.uint8]:
 
 @dataclass(frozen=True)
 class Seen:
-    """``corners`` (rows, columns, 2), ``sigma`` (rows, columns) and ``blur`` as of a
-    :class:`Detection`.
+    """``corners`` (rows, columns, 2), ``sigma`` (rows, columns), ``blur`` and ``printed`` as of
+    a :class:`Detection`.
     """  # noqa: D205
 
     corners: NDArray[np.float64]
     sigma: NDArray[np.float64]
     blur: float
+    printed: Printed
 
 
 def detect(picture: NDArray[np.uint8], target: Target) -> NDArray[np.float64]:
@@ -154,17 +179,19 @@ def detect(picture: NDArray[np.uint8], target: Target) -> NDArray[np.float64]:
 def look(picture: NDArray[np.uint8], target: Target) -> Seen:
     """As :func:`detect`, with standard errors and the spread of edges."""
     shape = (target.rows, target.columns)
-    nothing = np.full(shape, np.nan)
+    nothing, plain = np.full(shape, np.nan), Printed(target, False)
     if min(picture.shape) < 24:  # the detectors' filters need some room
-        return Seen(np.full((*shape, 2), np.nan), nothing, np.nan)
+        return Seen(np.full((*shape, 2), np.nan), nothing, np.nan, plain)
     if isinstance(target, CircleGrid):
         corners, blur = detect_circles(picture, target)
-        return Seen(corners, nothing, blur)
+        return Seen(corners, nothing, blur, plain)
     if isinstance(target, Chessboard):
-        found = _fit_chessboard(picture, target, _detect_chessboard(picture, target))
+        found, printed = _fit_chessboard(picture, target, _detect_chessboard(picture, target))
     else:
-        found = find_coded(picture, target)
-    return Seen(found.pixels.reshape(*shape, 2), found.sigma.reshape(shape), found.blur)
+        found, printed = find_coded(picture, target)
+    return Seen(
+        found.pixels.reshape(*shape, 2), found.sigma.reshape(shape), found.blur, printed
+    )
 
 
 # ---- chessboard
@@ -201,18 +228,17 @@ def _shrink(picture: NDArray[np.uint8], factor: float) -> NDArray[Any]:
 
 def _fit_chessboard(
     picture: NDArray[np.uint8], target: Chessboard, grid: NDArray[np.float64]
-) -> Found:
+) -> tuple[Found, Printed]:
     """The rendered board fitted to corners (rows, columns, 2) that are nearly right."""
     places = target.points()[..., :2].reshape(-1, 2) / target.square
-    seen = np.isfinite(grid[..., 0]).ravel()
-    known, pixels = places[seen], grid.reshape(-1, 2)[seen]
-    pitch = float(np.median(_pitch(grid))) if seen.any() else 1.0
+    found = grid.reshape(-1, 2)
+    pitch = float(np.median(_pitch(grid)))
     # The first square may be black or white.
-    boards = [
-        Board.of(cells, 1, REACH, pitch) for cells in (target.cells(), 255 - target.cells())
-    ]
-    board = max(boards, key=lambda b: likeness(picture, b, places, known, pixels))
-    return grow(picture, board, places, known, pixels)
+    printed = max(
+        (Printed(target, False), Printed(target, True)),
+        key=lambda p: likeness(picture, board_of(p, pitch), places, found),
+    )
+    return refit(picture, board_of(printed, pitch), places, found), printed
 
 
 # ---- common

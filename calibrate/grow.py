@@ -8,9 +8,7 @@ so that a board is followed through distortion that no homography of the whole c
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -45,10 +43,10 @@ def grow(
     """Corners at `places` (M, 2) of the board, from `known` places (N, 2) seen at `pixels`."""
     found = np.full(places.shape, np.nan)
     sigma = np.full(len(places), np.nan)
-    homographies = _neighbourhoods(places, found, known, pixels)
+    homographies = neighbourhoods(places, found, known, pixels)
     if not homographies:
         return Found(found, sigma, np.nan)
-    blur = fit_blur(picture, board, places, homographies, BLURS)
+    blur = fit_blur(picture, board, places, homographies)
     seen = 0
     while True:
         found, sigma = fit_all(picture, board, places, homographies, blur)
@@ -56,13 +54,29 @@ def grow(
         grown, seen = count > seen, max(count, seen)
         if not grown or count == len(places):
             break
-        homographies = _neighbourhoods(places, found, known, pixels)
+        homographies = neighbourhoods(places, found, known, pixels)
     if not seen:
         return Found(found, sigma, np.nan)
     # Once more, from neighbours that are all well placed now.
-    homographies = _neighbourhoods(places, found, known, pixels)
-    k = BLURS.index(blur)
-    blur = fit_blur(picture, board, places, homographies, BLURS[max(0, k - 1) : k + 2])
+    return refit(picture, board, places, found, blur)
+
+
+def refit(
+    picture: NDArray[np.uint8],
+    board: Board,
+    places: NDArray[np.float64],
+    found: NDArray[np.float64],
+    blur: float | None = None,
+) -> Found:
+    """Corners fitted anew, each where its neighbours among `found` (M, 2) put it.
+
+    `blur` is about the picture's, if it is known.
+    """
+    nothing = np.zeros((0, 2))
+    homographies = neighbourhoods(places, found, nothing, nothing)
+    if not homographies:
+        return Found(np.full_like(found, np.nan), np.full(len(found), np.nan), np.nan)
+    blur = fit_blur(picture, board, places, homographies, blur)
     return Found(*fit_all(picture, board, places, homographies, blur), blur)
 
 
@@ -92,22 +106,38 @@ def fit_blur(
     board: Board,
     places: NDArray[np.float64],
     homographies: dict[int, NDArray[np.float64]],
-    blurs: tuple[float, ...],
+    about: float | None = None,
 ) -> float:
-    """The one of `blurs` whose patches correlate best, over some of the corners."""
-    return max(blurs, key=lambda blur: _score(picture, board, places, homographies, blur))
+    """The blur of :data:`BLURS` whose patches correlate best, over some of the corners.
+
+    Searched from `about` on if it is given, else over all.
+    """
+    scores: dict[int, float] = {}
+
+    def score(k: int) -> float:
+        if k not in scores:
+            scores[k] = _score(picture, board, places, homographies, BLURS[k])
+        return scores[k]
+
+    start = range(1, len(BLURS), 2) if about is None else [BLURS.index(about)]
+    best = max(start, key=score)
+    while True:
+        sides = [k for k in (best - 1, best, best + 1) if 0 <= k < len(BLURS)]
+        better = max(sides, key=score)
+        if better == best:
+            return BLURS[best]
+        best = better
 
 
 def likeness(
     picture: NDArray[np.uint8],
     board: Board,
     places: NDArray[np.float64],
-    known: NDArray[np.float64],
-    pixels: NDArray[np.float64],
+    found: NDArray[np.float64],
 ) -> float:
-    """How much the picture is like the board about `known` places (N, 2) seen at `pixels`."""
-    nothing = np.full(places.shape, np.nan)
-    homographies = _neighbourhoods(places, nothing, known, pixels)
+    """How much the picture is like the board where its corners are at `found` (M, 2)."""
+    nothing = np.zeros((0, 2))
+    homographies = neighbourhoods(places, found, nothing, nothing)
     return _score(picture, board, places, homographies, BLURS[3])
 
 
@@ -124,7 +154,7 @@ def _score(
     return float(sum(fit.correlation for fit in fits))
 
 
-def _neighbourhoods(
+def neighbourhoods(
     places: NDArray[np.float64],
     found: NDArray[np.float64],
     known: NDArray[np.float64],
@@ -132,45 +162,61 @@ def _neighbourhoods(
 ) -> dict[int, NDArray[np.float64]]:
     """Homographies to pixels about each of `places`, by the number of the corner.
 
-    By the nearest found corners, but not by the corner itself; where they are too few the
-    places known from the start help.
+    By the nearest `found` corners, but not by the corner itself; where they are too few the
+    places `known` from the start help.
     """
-    seen = np.isfinite(found[:, 0])
+    seen = np.flatnonzero(np.isfinite(found[:, 0]))
+    board, image = places[seen], found[seen]
+    more = np.concatenate([board, known]), np.concatenate([image, pixels])
     homographies: dict[int, NDArray[np.float64]] = {}
     for i, place in enumerate(places):
-        others = seen.copy()
-        others[i] = False
-        h = _homography(place, places[others], found[others])
-        if h is None:
-            h = _homography(
-                place,
-                np.concatenate([places[others], known]),
-                np.concatenate([found[others], pixels]),
-            )
+        own = np.append(seen == i, np.zeros(len(known), bool))
+        h = _homography(place, board, image, own[: len(seen)])
+        if h is None and len(known):
+            h = _homography(place, *more, own)
         if h is not None:
             homographies[i] = h
     return homographies
 
 
 def _homography(
-    place: NDArray[np.float64], known: NDArray[np.float64], pixels: NDArray[np.float64]
+    place: NDArray[np.float64],
+    known: NDArray[np.float64],
+    pixels: NDArray[np.float64],
+    without: NDArray[np.bool_],
 ) -> NDArray[np.float64] | None:
-    distance = np.abs(known - place).max(axis=1)
-    near = np.flatnonzero(distance < NEAR)
+    """By the nearest of `known`, least squares of the direct linear equations."""
+    here = known - place
+    near = np.flatnonzero((np.abs(here).max(axis=1, initial=0) < NEAR) & ~without)
     if len(near) < 4:
         return None
-    near = near[np.argsort(np.hypot(*(known[near] - place).T), kind="stable")[:NEIGHBOURS]]
-    here = known[near] - place
-    spread = np.linalg.svd(here - here.mean(axis=0), compute_uv=False)
-    if spread[1] < 0.3 or (len(near) == 4 and _three_in_line(here)):
+    near = near[np.argsort((here[near] ** 2).sum(axis=1), kind="stable")[:NEIGHBOURS]]
+    x, y = here[near].T
+    middle = pixels[near].mean(axis=0)
+    u, v = (pixels[near] - middle).T
+    spread = np.linalg.eigvalsh(np.cov(x, y, bias=True) * len(x))
+    if spread[0] < 0.09 or (len(near) == 4 and _three_in_line(here[near])):
         return None
-    h: Any = cv2.findHomography(known[near], pixels[near])[0]
-    return None if h is None or abs(np.linalg.det(h)) < 1e-12 else np.asarray(h, float)
+    size = float(np.abs([u, v]).max())
+    u, v = u / size, v / size
+    one, zero = np.ones_like(x), np.zeros_like(x)
+    rows = np.concatenate(
+        [
+            np.stack([x, y, one, zero, zero, zero, -u * x, -u * y], axis=-1),
+            np.stack([zero, zero, zero, x, y, one, -v * x, -v * y], axis=-1),
+        ]
+    )
+    h = np.append(np.linalg.lstsq(rows, np.concatenate([u, v]), rcond=None)[0], 1.0)
+    to_pixels = np.array([[size, 0, middle[0]], [0, size, middle[1]], [0, 0, 1]])
+    from_place = np.array([[1, 0, -place[0]], [0, 1, -place[1]], [0, 0, 1.0]])
+    h = to_pixels @ h.reshape(3, 3) @ from_place
+    return None if abs(np.linalg.det(h)) < 1e-12 else np.asarray(h, float)
 
 
 def _three_in_line(four: NDArray[np.float64]) -> bool:
     """Whether three of four points lie in a line, which leaves a homography open."""
+    (a, b, c, d) = four
     return any(
-        abs(np.cross(np.append(b - a, 0.0), np.append(c - a, 0.0))[2]) < 0.05
-        for a, b, c in (four[[0, 1, 2]], four[[0, 1, 3]], four[[0, 2, 3]], four[[1, 2, 3]])
+        abs((q - p)[0] * (r - p)[1] - (q - p)[1] * (r - p)[0]) < 0.05
+        for p, q, r in ((a, b, c), (a, b, d), (a, c, d), (b, c, d))
     )

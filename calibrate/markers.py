@@ -33,7 +33,7 @@ THINNED = (3, 5, 9)
 #: Enough of a board's markers to look no further.
 ENOUGH = 0.8
 #: How far a neighbour may be from where a marker expects it, in sides of the marker and steps.
-NEIGHBOUR = 0.35
+NEIGHBOUR = 0.3
 
 
 @dataclass(frozen=True)
@@ -72,14 +72,14 @@ def consistent(markers: Markers, places: NDArray[np.float64]) -> NDArray[np.bool
     """Which of the N `markers` agree on one board, (N,): the largest group of neighbours.
 
     `places` (K, 4, 2) are the outlines on the board. A marker's own homography says where its
-    nearest neighbours should be.
+    nearest neighbours should be, and theirs where it should be.
     """
     count = len(markers.numbers)
     board, seen = places[markers.numbers], markers.outlines
     centre, middle = board.mean(axis=1), seen.mean(axis=1)
     apart = np.linalg.norm(centre[:, None] - centre, axis=-1)
     side = np.linalg.norm(board[:, 1] - board[:, 0], axis=-1)
-    group = np.arange(count)
+    expects = np.zeros((count, count), bool)
     for i in range(count):
         h = _homographies(board[i : i + 1], seen[i : i + 1])[0]
         size = np.sqrt(abs(cv2.contourArea(seen[i].astype(np.float32))))
@@ -89,8 +89,10 @@ def consistent(markers: Markers, places: NDArray[np.float64]) -> NDArray[np.bool
             if mapped[2] <= 0:
                 continue
             miss = np.linalg.norm(mapped[:2] / mapped[2] - middle[j])
-            if miss < NEIGHBOUR * size * apart[i, j] / side[i]:
-                group[group == group[j]] = group[i]
+            expects[i, j] = miss < NEIGHBOUR * size * apart[i, j] / side[i]
+    group = np.arange(count)
+    for i, j in np.argwhere(expects & expects.T).tolist():
+        group[group == group[j]] = group[i]
     if not count:
         return np.zeros(0, bool)
     names, sizes = np.unique(group, return_counts=True)

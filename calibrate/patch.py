@@ -38,7 +38,7 @@ class Board:
     in squares.
     """
 
-    cells: NDArray[np.uint8]
+    cells: NDArray[np.float32]
     n: int
     reach: float
 
@@ -48,7 +48,8 @@ class Board:
         `pitch` pixels: between their centres interpolated, edges are where they should be.
         """  # noqa: D205
         parts = max(1, round(2 * pitch / n))
-        return cls(np.kron(cells, np.ones((parts, parts), np.uint8)), n * parts, reach)
+        split = np.kron(cells, np.ones((parts, parts), np.uint8))
+        return cls(split.astype(np.float32), n * parts, reach)
 
 
 @dataclass(frozen=True)
@@ -168,7 +169,7 @@ def render_patch(
     cell_from_place = np.array([[n, 0, n - 0.5], [0, n, n - 0.5], [0, 0, 1.0]])
     # Beyond the board its outermost cells go on; they are hardly in reach.
     shade = cv2.warpPerspective(
-        board.cells.astype(np.float32),
+        board.cells,
         cell_from_place @ np.linalg.inv(h) @ pixel_from_fine,
         (count * FINE, count * FINE),
         flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,

@@ -42,7 +42,8 @@ def test_lens(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     files.append(tmp_path / "empty.png")
     write_picture(files[-1], np.full((300, 420), 80, np.uint8))
     output = tmp_path / "build" / "lens.cameramodel"
-    words = ["lens", *files, "--target", TARGET.spec, "--model", "opencv4", "-o", output]
+    words = ["lens", *files, "--target", TARGET.spec, "--model", "opencv4", "--no-cache"]
+    words += ["-o", output]
     run(*words, "--json")
     captured = capsys.readouterr()
     assert "empty.png: no board" in captured.err
@@ -77,7 +78,7 @@ def test_lens_refusals(tmp_path: Path) -> None:
         (["--target", TARGET.spec, "-o", tmp_path / "lens.txt"], r"ends in \.cameramodel"),
     ):
         with pytest.raises(UserError, match=message):
-            run("lens", picture, *words)
+            run("lens", picture, "--no-cache", *words)
     assert sorted(tmp_path.iterdir()) == [picture]
 
 

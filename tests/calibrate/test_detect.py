@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from chromeball.calibrate import detect_cache
 from chromeball.calibrate.detect import detect, detect_files, grey, judge, look
 from chromeball.calibrate.target import Charuco, Chessboard, Target, parse_target
 from chromeball.calibrate.virtual import board_poses, photograph, project
@@ -161,3 +163,28 @@ def test_bad_files(tmp_path: Path) -> None:
     broken.write_bytes(files[0].read_bytes()[:60])
     with pytest.raises(UserError, match=r"broken\.png"):
         detect_files([broken], CHESSBOARD)
+
+
+def test_cache_and_processes(tmp_path: Path) -> None:
+    """Two processes see what one does; what is kept is used by content, damage is mended."""
+    pose = board_poses(CHESSBOARD, CAMERA, 1)[0]
+    picture = photograph(CHESSBOARD, CAMERA, pose)
+    files = [write(tmp_path / f"{i}.png", np.roll(picture, i, axis=1)) for i in range(8)]
+    cache = tmp_path / "cache"
+    alone = detect_files(files, CHESSBOARD, cache=cache)
+    assert len(list(cache.iterdir())) == 8
+    both = detect_files(files, CHESSBOARD, workers=2)
+    for one, other in zip(alone, both, strict=True):
+        np.testing.assert_array_equal(one.corners, other.corners)
+        np.testing.assert_array_equal(one.sigma, other.sigma)
+        assert (one.verdict, one.printed) == (other.verdict, other.printed)
+    for kept in cache.iterdir():
+        kept.write_bytes(kept.read_bytes()[:100])
+    mended = detect_files(files[:1], CHESSBOARD, cache=cache)[0]
+    np.testing.assert_array_equal(mended.corners, alone[0].corners)
+    # The same content under another name is not searched again.
+    entry = detect_cache.entry(cache, files[0], CHESSBOARD)
+    detect_cache.store(entry, replace(mended, verdict="kept"))
+    copy = write(tmp_path / "copy.png", picture)
+    again = detect_files([copy], CHESSBOARD, cache=cache)[0]
+    assert (again.file, again.verdict) == (copy, "kept")

@@ -13,6 +13,7 @@ from chromeball.scene.record import to_json
 
 type Out = Annotated[Path, Parameter(name=["-o", "--output"])]
 type Json = Annotated[bool, Parameter(name="--json", negative="")]
+type Cache = Annotated[bool, Parameter(name="--cache", negative="--no-cache")]
 
 
 def say(message: str) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from chromeball.cli.calibrate.arguments import Json, Out, print_figures, say
+from chromeball.cli.calibrate.arguments import Cache, Json, Out, print_figures
 from chromeball.scene.errors import UserError
 from chromeball.scene.record import Stage, check_output, record_path
 
@@ -19,6 +19,7 @@ def lens(
     watch: Path | None = None,
     views: int | None = None,
     reuse: Path | None = None,
+    cache: Cache = True,
     json: Json = False,
 ) -> None:
     """Calibrate one lens from pictures of a target.
@@ -55,14 +56,16 @@ def lens(
     output
         The .cameramodel to write, in mrcal's format, with the covariance of the intrinsics; for
         mrcal's models, the first five, with all that the solution was made of.
+    cache
+        Keep what was detected in a picture, by its content, and use it the next time.
     json
         Print the figures as JSON.
 
     """
-    from chromeball.calibrate.detect import Detection, detect_files
     from chromeball.calibrate.lens import MODELS
     from chromeball.calibrate.target import parse_target
     from chromeball.calibrate.watch import watch_lens
+    from chromeball.cli.calibrate.detecting import detect_told
     from chromeball.cli.calibrate.kept import keep_camera
     from chromeball.cli.calibrate.solved import solve_and_tell, tell_progress
 
@@ -81,9 +84,6 @@ def lens(
     check_output(output, inputs)
     stage = Stage("calibrate lens", inputs, target=target, model=model)
 
-    def tell(detection: Detection) -> None:
-        say(f"{detection.file}: {detection.verdict}")
-
     with stage:
         if watch is not None:
             stand_in = "kb4" if model == "auto" else model
@@ -93,7 +93,7 @@ def lens(
             stage.inputs = [d.file for d in detections]
             check_output(output, stage.inputs)
         else:
-            detections = detect_files(images, board, tell)
+            detections = detect_told(images, board, cache)
         if reuse is not None and keep_camera(stage, detections, board, reuse, output):
             if json:
                 print_figures(stage.figures)

@@ -10,11 +10,13 @@ from typing import Any
 import numpy as np
 
 from chromeball.calibrate.choose import choose_model
-from chromeball.calibrate.detect import Detection, grey
+from chromeball.calibrate.detect import grey
+from chromeball.calibrate.detection import Detection
 from chromeball.calibrate.halves import Halves, compare_halves
 from chromeball.calibrate.lens import calibrate_lens
 from chromeball.calibrate.lens_result import Lens
 from chromeball.calibrate.lit import brightest, lit_places, spread_out
+from chromeball.calibrate.look_again import SecondLook, look_again
 from chromeball.calibrate.plots import (
     plot_coverage,
     plot_halves,
@@ -55,6 +57,12 @@ def solve_and_tell(
         chosen = choice.model
         stage.figures |= {"held_out_rms": choice.errors, "reason": choice.reason}
         say(f"{chosen}: {choice.reason}")
+    second = look_again(
+        used, calibrate_lens(corners, board, size, chosen, files), board, chosen
+    )
+    used = second.detections
+    corners = np.array([d.corners for d in used])
+    stage.figures["second_look"] = _told(second)
     lens, halves, verdict = judged(corners, board, size, chosen, used, searched=model == "auto")
     # The verdict stands first in the record as on the screen.
     stage.figures = {
@@ -104,6 +112,22 @@ def tell_progress(progress: Progress) -> None:
     say(f"  {progress.views} views: {progress.verdict.sentence}")
     for line in progress.verdict.advice:
         say(f"  - {line}")
+
+
+def _told(second: SecondLook) -> dict[str, Any]:
+    """The second look's figures, said if it found anything."""
+    if second.won:
+        verb = "kept" if second.kept else "not kept"
+        say(
+            f"second look: {second.won} more corners, {verb}: held-out error "
+            f"{second.before:.3f} px without, {second.after:.3f} px with them"
+        )
+    return {
+        "won": second.won,
+        "kept": second.kept,
+        "held_out_before": second.before,
+        "held_out_after": second.after,
+    }
 
 
 def telling_views(detections: Sequence[Detection]) -> tuple[list[Detection], list[Detection]]:

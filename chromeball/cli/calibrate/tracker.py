@@ -64,7 +64,8 @@ def tracker(
     """
     import numpy as np
 
-    from chromeball.calibrate.detect import Detection, detect_files
+    from chromeball.calibrate.detect import detect_files
+    from chromeball.calibrate.detection import Detection
     from chromeball.calibrate.formats import read_camera
     from chromeball.calibrate.target import parse_target
     from chromeball.calibrate.tracker import solve_tracker

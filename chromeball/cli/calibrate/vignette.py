@@ -64,7 +64,8 @@ def board(
         Print the figures as JSON.
 
     """
-    from chromeball.calibrate.detect import Detection, detect_files
+    from chromeball.calibrate.detect import detect_files
+    from chromeball.calibrate.detection import Detection
     from chromeball.calibrate.target import parse_target
     from chromeball.calibrate.vignette import solve
     from chromeball.calibrate.vignette_board import board_samples, check_target

@@ -1,0 +1,37 @@
+"""Detection as the commands do it: on all cores, told as it goes, kept for the next time."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import Progress
+
+from chromeball.calibrate.detect import detect_files
+from chromeball.calibrate.detect_cache import default_folder
+from chromeball.calibrate.detection import Detection
+from chromeball.calibrate.target import Target
+from chromeball.cli.calibrate.arguments import say
+
+
+def detect_told(images: Sequence[Path], target: Target, cache: bool) -> list[Detection]:
+    """Detections in pictures, on all cores, told one by one and on a terminal by a bar."""
+    with Progress(
+        console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()
+    ) as bar:
+        row = bar.add_task("detect", total=len(images))
+
+        def tell(detection: Detection) -> None:
+            say(f"{detection.file}: {detection.verdict}")
+            bar.advance(row)
+
+        return detect_files(
+            images,
+            target,
+            tell,
+            workers=os.process_cpu_count() or 1,
+            cache=default_folder() if cache else None,
+        )
