@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from chromeball.calibrate.lens import calibrate_lens
+from chromeball.calibrate.lens import FEWEST_VIEWS, calibrate_lens, check_views
 from chromeball.calibrate.lens_result import Lens
 from chromeball.calibrate.solve import Fit, fit_start, pose_residuals
 from chromeball.calibrate.target import Target
@@ -34,8 +34,11 @@ def choose_model(
     target: Target,
     size: tuple[int, int],
     progress: Callable[[str, float], object] | None = None,
+    start: Fit | None = None,
 ) -> Choice:
     """The first of :data:`CANDIDATES` whose held-out error is as low as the lowest.
+
+    `start` is a fit of the same views, if there is one already.
 
     As low means: the logarithm of the two models' errors, view by view, differs by no more
     than the standard error of its median. The error of a model that these corners do not
@@ -44,10 +47,16 @@ def choose_model(
     Raises
     ------
     UserError
-        When no candidate is determined.
+        When no candidate is determined, or the views are too few to leave some out.
 
     """
-    start = fit_start(corners, target, size)
+    check_views(len(corners))
+    if len(corners) == FEWEST_VIEWS:
+        raise UserError(
+            f"{FEWEST_VIEWS} pictures with the board do not tell lens models apart: take more, "
+            "better 15, or choose one with --model, opencv4 for an ordinary lens"
+        )
+    start = fit_start(corners, target, size) if start is None else start
     found: dict[str, NDArray[np.float64]] = {}
     errors: dict[str, float] = {}
     refusal: UserError | None = None

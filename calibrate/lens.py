@@ -53,11 +53,7 @@ def calibrate_lens(
     """
     if model not in MODELS or model == "auto":
         raise UserError(f"unknown lens model {model!r}; one of {', '.join(MODELS)}")
-    if len(corners) < FEWEST_VIEWS:
-        raise UserError(
-            f"the board was found in {_count(len(corners), 'picture')}; a lens needs "
-            f"{FEWEST_VIEWS}, better 15, with the board tilted in different directions"
-        )
+    check_views(len(corners))
     if model == "splined" and isinstance(target, AprilGrid):
         raise UserError(
             "mrcal, which solves splined, knows only boards of evenly spaced corners, not "
@@ -73,6 +69,15 @@ def calibrate_lens(
     if model in FISHEYES or isinstance(target, AprilGrid):
         return judge(fit, corners, target)
     return solve_mrcal.refine(fit, corners, target, paths)
+
+
+def check_views(count: int) -> None:
+    """Raise :class:`UserError` where `count` views are too few for a lens."""
+    if count < FEWEST_VIEWS:
+        raise UserError(
+            f"the board was found in {_count(count, 'picture')}; a lens needs "
+            f"{FEWEST_VIEWS}, better 15, with the board tilted in different directions"
+        )
 
 
 def _count(n: int, noun: str) -> str:

@@ -23,6 +23,7 @@ from chromeball.calibrate.lens import calibrate_lens
 from chromeball.calibrate.lens_result import Lens
 from chromeball.calibrate.patch import BLURS
 from chromeball.calibrate.printed import Printed, board_of
+from chromeball.calibrate.solve import Fit
 from chromeball.calibrate.target import CircleGrid, Target
 from chromeball.scene.image import read_image
 from chromeball.scene.pose import Pose
@@ -57,9 +58,15 @@ class SecondLook:
 
 
 def look_again(
-    detections: Sequence[Detection], lens: Lens, target: Target, model: str
+    detections: Sequence[Detection],
+    lens: Lens,
+    target: Target,
+    model: str,
+    start: Fit | None = None,
 ) -> SecondLook:
     """What the `lens`, solved as `model` from `detections`, helps to see in the same pictures.
+
+    `start` is a fit of these views, if there is one already.
 
     Views that the lens could not place stay as they are, and so do grids of circles.
     """
@@ -69,12 +76,12 @@ def look_again(
         return SecondLook(lens, list(detections), 0, math.nan, math.nan)
     first, second = (np.array([d.corners for d in ds]) for ds in (detections, better))
     before, after = (
-        _held_out(corners, first, target, lens, model) for corners in (first, second)
+        _held_out(corners, first, target, lens, model, start) for corners in (first, second)
     )
     if after > before:
         return SecondLook(lens, list(detections), won, before, after)
     paths = [str(d.file) for d in detections]
-    again = calibrate_lens(second, target, lens.camera.size, model, paths)
+    again = calibrate_lens(second, target, lens.camera.size, model, paths, start)
     return SecondLook(again, better, won, before, after)
 
 
@@ -104,13 +111,14 @@ def _held_out(
     target: Target,
     lens: Lens,
     model: str,
+    start: Fit | None,
 ) -> float:
     """Median of the views' RMS on `judged` corners by lenses of the other views' `corners`."""
     errors = np.full(len(corners), np.inf)
     for fold in range(FOLDS):
         out = np.arange(len(corners)) % FOLDS == fold
         if out.any():
-            part = calibrate_lens(corners[~out], target, lens.camera.size, model)
+            part = calibrate_lens(corners[~out], target, lens.camera.size, model, start=start)
             errors[out] = pose_errors(part, judged[out], target)
     return float(np.median(errors))
 

@@ -268,7 +268,7 @@ def _other_advice(
             name = f"view {view}" if files is None else files[view]
             lines.append(
                 f"take {name} again or leave it out: {rejected[view]} of its {found[view]} "
-                "corners do not fit (was the board misread, or moving?)"
+                "corners do not fit (was the board misread, moving or bent?)"
             )
     width = float(np.ptp(target.points()[..., :2].reshape(-1, 2), axis=0).max())
     bow = float(np.abs(lens.bow).max())

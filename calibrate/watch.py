@@ -10,9 +10,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from chromeball.calibrate.detect import Detection, grey, judge
+from chromeball.calibrate.detect import grey, judge
+from chromeball.calibrate.detection import Detection
 from chromeball.calibrate.lens import FEWEST_VIEWS, calibrate_lens
 from chromeball.calibrate.lit import brightest, lit_places
+from chromeball.calibrate.printed import Printed
 from chromeball.calibrate.solve import fit_start
 from chromeball.calibrate.target import Target
 from chromeball.calibrate.verdict import Verdict, judge_lens
@@ -114,7 +116,14 @@ def watch_lens(
             if error is not None:
                 empty = np.full((target.rows, target.columns, 2), np.nan)
                 failed = Detection(
-                    path, (0, 0), empty, empty[..., 0], float("nan"), False, error.what
+                    file=path,
+                    size=(0, 0),
+                    corners=empty,
+                    sigma=empty[..., 0],
+                    blur=float("nan"),
+                    usable=False,
+                    verdict=error.what,
+                    printed=Printed(target, False),
                 )
                 tell(Progress(failed, len(_counting(detections)), None, "not a picture"))
                 continue

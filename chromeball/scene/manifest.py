@@ -605,7 +605,7 @@ class Calibrate(Table, frozen=True):
 
     images: list[str] = []
     target: str | None = None
-    model: str = "opencv8"
+    model: str = "auto"
     camera: str | None = None
 
 

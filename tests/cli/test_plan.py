@@ -62,7 +62,7 @@ def test_commands_are_the_explicit_forms(root: Path) -> None:
     )
     assert command["calibrate lens"] == (
         "chromeball calibrate lens photos/board_1.jpg photos/board_2.jpg "
-        "--target chessboard:9x6:0.025 --model opencv8 -o build/lens.cameramodel"
+        "--target chessboard:9x6:0.025 --model auto -o build/lens.cameramodel"
     )
     assert command["envmap probe"] == (
         "chromeball envmap probe build/front.exr build/back.exr --yaw 0,-180 "

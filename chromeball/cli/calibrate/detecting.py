@@ -33,5 +33,17 @@ def detect_told(images: Sequence[Path], target: Target, cache: bool) -> list[Det
             target,
             tell,
             workers=os.process_cpu_count() or 1,
-            cache=default_folder() if cache else None,
+            cache=_writable(default_folder()) if cache else None,
         )
+
+
+def _writable(folder: Path) -> Path | None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if os.access(folder, os.W_OK):
+            return folder
+        reason = "it is read-only"
+    except OSError as error:
+        reason = str(error.strerror)
+    say(f"detections are not kept: {folder}: {reason}")
+    return None

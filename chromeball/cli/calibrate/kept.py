@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from chromeball.calibrate.detect import Detection
+from chromeball.calibrate.detection import Detection
 from chromeball.calibrate.reuse import check_reuse, taken_with
 from chromeball.calibrate.target import Target
 from chromeball.cli.calibrate.arguments import say

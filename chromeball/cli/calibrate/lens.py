@@ -15,7 +15,7 @@ def lens(
     *,
     target: str,
     output: Out,
-    model: str = "opencv8",
+    model: str = "auto",
     watch: Path | None = None,
     views: int | None = None,
     reuse: Path | None = None,
@@ -40,10 +40,10 @@ def lens(
         acircles:4x11:0.02 (every second row shifted by 0.02; rows that far apart, discs in a
         row twice as far).
     model
-        pinhole, opencv4, opencv5, opencv8, splined; kb4 for fisheyes beyond 180 degrees, too
+        auto is the simplest that predicts pictures left out of the solution as well as any;
+        or pinhole, opencv4, opencv5, opencv8, splined; kb4 for fisheyes beyond 180 degrees, too
         (Kannala and Brandt), kb4_decentred (with elements off the axis), equidistant,
-        equisolid, stereographic; or auto: the simplest that predicts pictures left out of the
-        solution as well as any.
+        equisolid, stereographic.
     watch
         Instead of pictures a folder into which they come: each is looked at when it is whole,
         and verdict and advice are told again. Ends with Ctrl-C, after so many views, or when

@@ -13,7 +13,7 @@ from chromeball.calibrate.choose import choose_model
 from chromeball.calibrate.detect import grey
 from chromeball.calibrate.detection import Detection
 from chromeball.calibrate.halves import Halves, compare_halves
-from chromeball.calibrate.lens import calibrate_lens
+from chromeball.calibrate.lens import FEWEST_VIEWS, calibrate_lens
 from chromeball.calibrate.lens_result import Lens
 from chromeball.calibrate.lit import brightest, lit_places, spread_out
 from chromeball.calibrate.look_again import SecondLook, look_again
@@ -27,7 +27,7 @@ from chromeball.calibrate.plots import (
     plot_worst,
 )
 from chromeball.calibrate.reuse import taken_with
-from chromeball.calibrate.solve import fit_start
+from chromeball.calibrate.solve import Fit, fit_start
 from chromeball.calibrate.target import Target
 from chromeball.calibrate.verdict import Verdict, judge_lens
 from chromeball.calibrate.views import repeated_views, spread_views
@@ -50,20 +50,19 @@ def solve_and_tell(
     used, dropped = telling_views(detections)
     corners, files = np.array([d.corners for d in used]), [str(d.file) for d in used]
     chosen = model
+    start = fit_start(corners, board, size) if len(used) >= FEWEST_VIEWS else None
     if model == "auto":
         choice = choose_model(
-            corners, board, size, lambda m, e: say(f"{m}: held-out error {e:.3f} px")
+            corners, board, size, lambda m, e: say(f"{m}: held-out error {e:.3f} px"), start
         )
         chosen = choice.model
         stage.figures |= {"held_out_rms": choice.errors, "reason": choice.reason}
         say(f"{chosen}: {choice.reason}")
-    second = look_again(
-        used, calibrate_lens(corners, board, size, chosen, files), board, chosen
-    )
-    used = second.detections
-    corners = np.array([d.corners for d in used])
+    lens = calibrate_lens(corners, board, size, chosen, files, start)
+    second = look_again(used, lens, board, chosen, start)
+    lens, used = second.lens, second.detections
     stage.figures["second_look"] = _told(second)
-    lens, halves, verdict = judged(corners, board, size, chosen, used, searched=model == "auto")
+    halves, verdict = judged(lens, board, chosen, used, start, searched=model == "auto")
     # The verdict stands first in the record as on the screen.
     stage.figures = {
         "verdict": verdict.sentence,
@@ -148,18 +147,16 @@ def telling_views(detections: Sequence[Detection]) -> tuple[list[Detection], lis
 
 
 def judged(
-    corners: np.ndarray[Any, np.dtype[np.float64]],
+    lens: Lens,
     board: Target,
-    size: tuple[int, int],
     model: str,
     used: Sequence[Detection],
+    start: Fit | None,
     *,
     searched: bool,
-) -> tuple[Lens, Halves | None, Verdict]:
-    """The lens of `model`, its halves where they can be solved, and the verdict."""
+) -> tuple[Halves | None, Verdict]:
+    """Halves of the lens's views, where they can be solved, and the verdict."""
     files = [str(d.file) for d in used]
-    start = fit_start(corners, board, size) if len(corners) >= 3 else None
-    lens = calibrate_lens(corners, board, size, model, files, start)
     try:
         halves = compare_halves(lens, board, model, start)
     except UserError as error:
@@ -179,7 +176,7 @@ def judged(
         searched=searched,
         columns=18,
     )
-    return lens, halves, verdict
+    return halves, verdict
 
 
 def _print(title: str, lens: Lens, verdict: Verdict) -> None:
