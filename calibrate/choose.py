@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,10 +35,12 @@ def choose_model(
     size: tuple[int, int],
     progress: Callable[[str, float], object] | None = None,
     start: Fit | None = None,
+    candidates: Sequence[str] = CANDIDATES,
 ) -> Choice:
-    """The first of :data:`CANDIDATES` whose held-out error is as low as the lowest.
+    """The simplest lens whose held-out error is as low as the lowest.
 
-    `start` is a fit of the same views, if there is one already.
+    `candidates` are models, the simplest first; `start` is a fit of the same views, if there is
+    one already.
 
     As low means: the logarithm of the two models' errors, view by view, differs by no more
     than the standard error of its median. The error of a model that these corners do not
@@ -60,7 +62,7 @@ def choose_model(
     found: dict[str, NDArray[np.float64]] = {}
     errors: dict[str, float] = {}
     refusal: UserError | None = None
-    for model in CANDIDATES:
+    for model in candidates:
         try:
             found[model] = held_out_errors(corners, target, size, model, start=start)
             errors[model] = float(np.median(found[model]))
@@ -73,7 +75,7 @@ def choose_model(
         raise refusal or UserError("no lens model reaches the corners of most pictures")
     chosen = next(m for m in found if m == best or _as_low(found[m], found[best]))
     if chosen == best:
-        others = [m for m in CANDIDATES[: CANDIDATES.index(best)]]
+        others = list(candidates[: candidates.index(best)])
         than = f"simpler ones ({', '.join(others)}) predict worse" if others else "the simplest"
         return Choice(chosen, errors, f"least held-out error; {than}")
     reason = f"as good as {best} on left-out pictures within the errors, and simpler"

@@ -132,14 +132,10 @@ def start_poses(points: NDArray[np.float64], rays: NDArray[np.float64]) -> list[
     Two for points in a plane, the better one first; none where the rays spread over 85 degrees
     from their mean or the solver fails.
     """
-    axis = rays.mean(axis=0)
-    if np.linalg.norm(axis) < 1e-6:
+    seen = on_plane(rays)
+    if seen is None:
         return []
-    turn = _turn_to_z(axis / np.linalg.norm(axis))
-    turned = rays @ turn.T
-    if turned[:, 2].min() < math.cos(math.radians(85)):
-        return []
-    plane = np.ascontiguousarray(turned[:, :2] / turned[:, 2:])
+    plane, turn = seen
     flat = _flatness(points) == 2
     method = cv2.SOLVEPNP_IPPE if flat else cv2.SOLVEPNP_SQPNP
     try:
@@ -179,6 +175,23 @@ def _check_spread(q: NDArray[np.float64]) -> None:
     if gaps.min() < 1:
         i, j = np.unravel_index(np.argmin(gaps), gaps.shape)
         raise UserError(f"points {i + 1} and {j + 1} were clicked at the same pixel")
+
+
+def on_plane(
+    rays: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    """Where `rays` (N, 3), turned so that their mean is the axis, cross z = 1; and the turn.
+
+    None where they spread over 85 degrees.
+    """
+    axis = rays.mean(axis=0)
+    if np.linalg.norm(axis) < 1e-6:
+        return None
+    turn = _turn_to_z(axis / np.linalg.norm(axis))
+    turned = rays @ turn.T
+    if turned[:, 2].min() < math.cos(math.radians(85)):
+        return None
+    return np.ascontiguousarray(turned[:, :2] / turned[:, 2:]), turn
 
 
 def _flatness(p: NDArray[np.float64]) -> int:

@@ -1,8 +1,7 @@
 """The lens of each camera of a rig by itself, to begin with and to compare with.
 
-No focal length is asked for: lenses of many fields of view are tried on a few boards, the best
-two fitted as Kannala and Brandt's (2006), the best of these turned into the model that is
-wanted, and all fitted with Cauchy's weights. The joint solution has the last word.
+It is what `calibrate lens` solves from some of the views, but for the entrance pupil, which
+stands still in a rig. The joint solution has the last word.
 """
 
 from __future__ import annotations
@@ -13,30 +12,24 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from chromeball.calibrate.adjust import Estimate, adjust, camera_points, covariance, residuals
+from chromeball.calibrate.adjust import Estimate, residuals
+from chromeball.calibrate.choose import CANDIDATES as LENSES
 from chromeball.calibrate.choose import choose_model
-from chromeball.calibrate.convert import converted
 from chromeball.calibrate.lens import FEWEST_VIEWS, OPENCV
-from chromeball.calibrate.lens_result import LEAST_TILT, PARALLEL, check_focal
-from chromeball.calibrate.rig_solve import (
-    BOW_DEVIATION,
-    CAUCHY,
-    FEWEST_CORNERS,
-    K_DEVIATION,
-    OUTLIER,
-)
+from chromeball.calibrate.rig_solve import FEWEST_CORNERS, OUTLIER
 from chromeball.calibrate.rig_start import place_boards
-from chromeball.calibrate.solve import FISHEYES, UNEXPLAINED
+from chromeball.calibrate.solve import FISHEYES, fit_model, fit_start, judge
 from chromeball.calibrate.target import Target
 from chromeball.scene.camera import CameraModel
 from chromeball.scene.errors import UserError
+from chromeball.scene.pose import Pose
 
 #: A splined lens has too many unknowns for a start from few boards: it can be given.
 MODELS = ("auto", "pinhole", *OPENCV, *FISHEYES)
-#: Fields of view across the longer side tried as a start, degrees.
-FIELDS_OF_VIEW = (25, 45, 70, 100, 140, 185, 230, 290)
-#: Views that the search and the fit need; they are taken evenly from the session.
-SEARCH_VIEWS, FIT_VIEWS = 6, 24
+#: What auto chooses from.
+CANDIDATES = tuple(m for m in LENSES if m in MODELS)
+#: Views that the fit needs; they are taken evenly from the session.
+FIT_VIEWS = 24
 
 type Corners = NDArray[np.float64]
 
@@ -76,43 +69,21 @@ def calibrate_alone(
             f"the board was found in {len(views)} of its pictures; a lens needs "
             f"{FEWEST_VIEWS}, better 15, or must be given"
         )
-    fitted = _evenly(views, FIT_VIEWS)
+    fitted = views[np.linspace(0, len(views) - 1, min(len(views), FIT_VIEWS)).astype(int)]
     chosen = corners[fitted]
+    start = fit_start(chosen, target, size)
     if model == "auto":
-        model = choose_model(chosen, target, size).model
-    board = target.points()
-    rough = _search(corners[_evenly(views, SEARCH_VIEWS)], board, size)
-    camera = rough.camera
-    if model != "kb4":
-        points = camera_points(rough, board).reshape(-1, 3)
-        rays = points / np.linalg.norm(points, axis=-1, keepdims=True)
-        name = f"LENSMODEL_{model.upper()}" if model in OPENCV else model
-        camera, _ = converted(camera, name, rays)
-    poses, saw = place_boards(camera, board, chosen)
-    if saw.sum() < FEWEST_VIEWS:
-        raise UserError(UNEXPLAINED)
-    normals = poses[saw, :3, 2]
-    if np.arccos(np.clip(normals @ normals.T, -1, 1)).max() < LEAST_TILT:
-        raise UserError(PARALLEL)
-    start = Estimate(camera, np.zeros(2), poses[saw, :3, :3], poses[saw, :3, 3])
-    unknown = np.arange(len(camera.intrinsics) + 4) < len(camera.intrinsics) + 2
-    estimate = _fit(start, board, chosen[saw], unknown, rounds=2)
-    error = residuals(estimate, board, chosen[saw])
-    sigma = _sigma(error, int(unknown.sum() + 6 * saw.sum()))
-    used = np.hypot(error[..., 0], error[..., 1]) < OUTLIER * sigma
-    k = len(camera.intrinsics)
-    known, _ = covariance(
-        estimate, board, chosen[saw], used, _precision(k, board, sigma), unknown
-    )
-    spread = sigma**2 * known[:k, :k]
-    check_focal(estimate.camera.intrinsics, np.sqrt(np.diag(spread)), 2 if k > 3 else 1)
+        model = choose_model(chosen, target, size, start=start, candidates=CANDIDATES).model
+    name = f"LENSMODEL_{model.upper()}" if model in OPENCV else model
+    lens = judge(fit_model(start, chosen, target, name, travel=False), chosen, target)
     if len(fitted) < len(views):
-        return replace(place_alone(corners, target, estimate.camera), covariance=spread)
-    saw_all, poses_all = np.zeros(len(corners), bool), np.tile(np.eye(4), (len(corners), 1, 1))
-    saw_all[fitted[saw]] = True
-    poses_all[fitted[saw], :3, :3] = estimate.rotations
-    poses_all[fitted[saw], :3, 3] = estimate.translations
-    return Alone(estimate.camera, poses_all, saw_all, sigma, spread)
+        return replace(place_alone(corners, target, lens.camera), covariance=lens.covariance)
+    poses, saw = np.tile(np.eye(4), (len(corners), 1, 1)), np.zeros(len(corners), bool)
+    for view, frame in zip(fitted, lens.camera_from_board, strict=True):
+        if np.isfinite(frame).all():
+            saw[view] = True
+            poses[view] = Pose.from_rotation_vector(frame[:3], frame[3:]).matrix()
+    return Alone(lens.camera, poses, saw, lens.sigma, lens.covariance)
 
 
 def place_alone(corners: Corners, target: Target, camera: CameraModel) -> Alone:
@@ -127,80 +98,6 @@ def place_alone(corners: Corners, target: Target, camera: CameraModel) -> Alone:
     return Alone(camera, poses, saw, sigma, none)
 
 
-# ---- stages
-
-
-def _evenly(views: NDArray[np.intp], count: int) -> NDArray[np.intp]:
-    if len(views) <= count:
-        return views
-    return views[np.linspace(0, len(views) - 1, count).round().astype(int)]
-
-
-@dataclass(frozen=True)
-class _Tried:
-    """A lens before those views that it ``seen`` (V,) has poses for."""
-
-    estimate: Estimate
-    seen: NDArray[np.bool_]
-
-
-def _search(corners: Corners, board: Corners, size: tuple[int, int]) -> Estimate:
-    """A lens of Kannala and Brandt's from fields of view tried on a few boards."""
-    tried: list[tuple[float, _Tried]] = []
-    for degrees in FIELDS_OF_VIEW:
-        fisheye = CameraModel.fisheye(
-            "equidistant", size, math.radians(degrees), radius=max(size) / 2
-        )
-        f, cx, cy = fisheye.intrinsics
-        camera = CameraModel("kb4", np.array([f, f, cx, cy, 0, 0, 0, 0]), size)
-        poses, saw = place_boards(camera, board, corners, refine=False)
-        if saw.sum() < min(len(corners), FEWEST_VIEWS):
-            continue
-        start = Estimate(camera, np.zeros(2), poses[saw, :3, :3], poses[saw, :3, 3])
-        tried.append((_median(start, board, corners, saw), _Tried(start, saw)))
-    if not tried:
-        raise UserError(UNEXPLAINED)
-    tried.sort(key=lambda pair: pair[0])
-    core, least = np.arange(12) < 4, math.inf
-    best = tried[0][1]
-    for _, candidate in tried[:2]:
-        saw = candidate.seen
-        estimate = _fit(candidate.estimate, board, corners[saw], core, rounds=1)
-        miss = _median(estimate, board, corners, saw)
-        if miss < least:
-            best, least = _Tried(estimate, saw), miss
-    return _fit(best.estimate, board, corners[best.seen], np.arange(12) < 10, rounds=2)
-
-
-def _fit(
-    estimate: Estimate,
-    board: Corners,
-    corners: Corners,
-    free: NDArray[np.bool_],
-    rounds: int = 3,
-) -> Estimate:
-    """Cauchy's estimate, its scale renewed from the residuals."""
-    for _ in range(rounds):
-        distance = _distance(estimate, board, corners)
-        found, sigma = np.isfinite(distance), float(np.nanmedian(distance))
-        sigma = max(sigma / math.sqrt(2 * math.log(2)), 1e-6)
-        known = _precision(len(free) - 4, board, sigma)
-        estimate = adjust(
-            estimate, board, corners, found,
-            free=free, precision=known, scale=CAUCHY * sigma, steps=12, least_gain=1e-4,
-        )  # fmt: skip
-    return estimate
-
-
-def _precision(intrinsics: int, board: Corners, sigma: float) -> Corners:
-    """Inverse variances of weak knowledge, times sigma squared, (intrinsics + 4,)."""
-    known = np.zeros(intrinsics + 4)
-    known[4:intrinsics] = (sigma / K_DEVIATION) ** 2
-    width = float(np.ptp(board[..., :2], axis=(0, 1)).max())
-    known[intrinsics : intrinsics + 2] = (sigma / (BOW_DEVIATION * width)) ** 2
-    return known
-
-
 def _sigma(error: Corners, unknowns: int) -> float:
     """Deviation of a coordinate by the residuals (V, rows, columns, 2) that fit."""
     distance = np.hypot(error[..., 0], error[..., 1])
@@ -210,18 +107,3 @@ def _sigma(error: Corners, unknowns: int) -> float:
         free = max(2 * int(used.sum()) - int(unknowns), 1)
         sigma = math.sqrt(float((error[used] ** 2).sum()) / free)
     return max(sigma, 1e-9)
-
-
-def _median(
-    estimate: Estimate, board: Corners, corners: Corners, seen: NDArray[np.bool_]
-) -> float:
-    """Median distance over all corners; those of a view without a pose are infinitely far."""
-    miss = np.full(corners.shape[:3], math.inf)
-    miss[seen] = _distance(estimate, board, corners[seen])
-    return float(np.median(miss[np.isfinite(corners[..., 0])]))
-
-
-def _distance(estimate: Estimate, board: Corners, corners: Corners) -> Corners:
-    error = residuals(estimate, board, corners)
-    length = np.hypot(error[..., 0], error[..., 1])
-    return np.where(np.isfinite(corners[..., 0]) & np.isnan(length), math.inf, length)

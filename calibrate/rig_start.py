@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chromeball.calibrate.adjust import Estimate, adjust, residuals
-from chromeball.calibrate.pose import start_poses
+from chromeball.calibrate.board_pose import board_poses
 from chromeball.calibrate.rig_solve import FEWEST_CORNERS, RigEstimate
 from chromeball.calibrate.target import Chessboard, CircleGrid, Target
 from chromeball.scene.camera import CameraModel
@@ -93,7 +93,7 @@ def place_boards(
     for view, seen in enumerate(np.isfinite(rays).all(axis=-1)):
         if seen.sum() < FEWEST_CORNERS:
             continue
-        if rivals := start_poses(board[seen], rays[view][seen]):
+        if rivals := board_poses(board[seen], rays[view][seen]):
             starts.append((view, rivals))
     poses = np.tile(np.eye(4), (len(corners), 1, 1))
     least = np.full(len(corners), math.inf)

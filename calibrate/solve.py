@@ -1,10 +1,10 @@
 """One lens of any model by our own least squares; no focal length is asked for.
 
 Lenses of many fields of view are tried as a start, each board posed by its rays turned to the
-axis (:func:`chromeball.calibrate.pose.start_poses`), which holds beyond 90 degrees. The start
-is Kannala and Brandt's lens (2006), which bends to any other; the model asked for begins as the
-nearest to it. Everything is estimated together, the board's bow included: with Cauchy's weights
-first, then by least squares on the corners that fit.
+axis (:func:`chromeball.calibrate.board_pose.board_poses`), which holds beyond 90 degrees. The
+start is Kannala and Brandt's lens (2006), which bends to any other; the model asked for begins
+as the nearest to it. Everything is estimated together, the board's bow included: with Cauchy's
+weights first, then by least squares on the corners that fit.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from chromeball.calibrate.adjust import (
     covariance,
     residuals,
 )
+from chromeball.calibrate.board_pose import board_poses
 from chromeball.calibrate.convert import converted, parameters
 from chromeball.calibrate.lens_result import (
     LEAST_TILT,
@@ -30,7 +31,6 @@ from chromeball.calibrate.lens_result import (
     check_focal,
     largest_tilt,
 )
-from chromeball.calibrate.pose import start_poses
 from chromeball.calibrate.target import Target
 from chromeball.scene.camera import CameraModel
 from chromeball.scene.errors import UserError
@@ -39,6 +39,8 @@ from chromeball.scene.pose import Pose
 FISHEYES = ("kb4", "kb4_decentred", "equidistant", "equisolid", "stereographic")
 #: Fields of view across the longer side tried as a start, degrees.
 FIELDS_OF_VIEW = (12, 20, 40, 60, 80, 100, 125, 150, 180, 215, 255, 300)
+#: So many of these are bent to the corners.
+MOST_LIKELY = 4
 #: So many views, spread over the pictures, find the start.
 START_VIEWS = 24
 #: And so many of those the field of view.
@@ -110,10 +112,18 @@ def fit_start(corners: NDArray[np.float64], target: Target, size: tuple[int, int
     return Fit(placed, estimate, found[placed] & (_distance(error) < 3 * scale), scale)
 
 
-def fit_model(start: Fit, corners: NDArray[np.float64], target: Target, model: str) -> Fit:
+def fit_model(
+    start: Fit,
+    corners: NDArray[np.float64],
+    target: Target,
+    model: str,
+    *,
+    travel: bool = True,
+) -> Fit:
     """The lens of `model`, a :class:`CameraModel`'s, that explains the corners best.
 
-    `start` may be of the same corners or of others of the same lens.
+    `start` may be of the same corners or of others of the same lens. Without `travel` the
+    entrance pupil of a kb4 stands still, too.
 
     Raises
     ------
@@ -133,7 +143,7 @@ def fit_model(start: Fit, corners: NDArray[np.float64], target: Target, model: s
     still = np.arange(parameters(model) + 4) < parameters(model) + 2
     estimate = _robust(estimate, board, corners[placed], found[placed], still)
     # A lens of one parameter would bend by the pupil what it cannot bend itself.
-    if model.startswith("kb4"):
+    if travel and model.startswith("kb4"):
         moving = _robust(estimate, board, corners[placed], found[placed], still | True)
         if _earned(estimate, moving, board, corners[placed]):
             return _settle(placed, moving, board, corners, found, still | True)
@@ -186,25 +196,29 @@ def _start(
     Lenses are judged by the median distance over all corners: those of a view without a pose
     count as infinitely far.
     """
-    best: Estimate | None = None
-    least = math.inf
+
+    def median(estimate: Estimate, placed: NDArray[np.intp]) -> float:
+        distance = np.full(found.shape, math.inf)
+        distance[placed] = _distance(residuals(estimate, board, corners[placed]))
+        return float(np.median(distance[found]))
+
+    tried: list[tuple[float, NDArray[np.intp], Estimate]] = []
     for degrees in FIELDS_OF_VIEW:
         f = max(size) / math.radians(degrees)
         core = np.array([f, f, (size[0] - 1) / 2, (size[1] - 1) / 2, 0, 0, 0, 0])
         camera = CameraModel("kb4", core, size)
         start = Estimate(camera, np.zeros(2), np.zeros((0, 3, 3)), np.zeros((0, 3)))
         placed, estimate = _place(start, board, corners, found, None)
-        if len(placed) < 3:
-            continue
-        estimate = _robust(estimate, board, corners[placed], found[placed], CORE, rounds=2)
-        distance = np.full(found.shape, math.inf)
-        distance[placed] = _distance(residuals(estimate, board, corners[placed]))
-        error = float(np.median(distance[found]))
-        if error < least:
-            best, least = estimate, error
-    if best is None:
+        if len(placed) >= 3:
+            tried.append((median(estimate, placed), placed, estimate))
+    if not tried:
         raise UserError(UNEXPLAINED)
-    return best
+    tried.sort(key=lambda lens: lens[0])
+    bent: list[tuple[float, Estimate]] = []
+    for _, placed, start in tried[:MOST_LIKELY]:
+        estimate = _robust(start, board, corners[placed], found[placed], CORE, rounds=2)
+        bent.append((median(estimate, placed), estimate))
+    return min(bent, key=lambda lens: lens[0])[1]
 
 
 def _place(
@@ -227,7 +241,7 @@ def _place(
         points, rays = board[seen][reached], rays[reached]
         if len(rays) < FEWEST_CORNERS:
             continue
-        candidates = start_poses(points, rays)
+        candidates = board_poses(points, rays)
         if not candidates:
             continue
         misses = [_miss(pose.apply(points), rays) for pose in candidates]

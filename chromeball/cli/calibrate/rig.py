@@ -48,7 +48,7 @@ def rig(
         The folder to write: NAME.cameramodel for each camera, rig.json, plots.
     model
         The lens model of all cameras, as `calibrate lens` has it without splined, or NAME=MODEL
-        of one; may be given several times. opencv8 by default.
+        of one; may be given several times. auto by default.
     lens
         Known lenses, NAME.cameramodel; they are kept as they are.
     refine
@@ -124,7 +124,7 @@ def rig(
 
 def _models(given: list[str], names: list[str], allowed: tuple[str, ...]) -> list[str]:
     """The lens model of each camera."""
-    chosen = dict.fromkeys(names, "opencv8")
+    chosen = dict.fromkeys(names, "auto")
     for common in (True, False):
         for text in given:
             name, equals, model = text.rpartition("=")
