@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,8 @@ LEAST_FIT = 0.35
 #: Relative standard error of the focal length beyond which a lens is open.
 WORST_FOCAL = 0.05
 WORST_CONDITION = 1e14
+#: Two cameras apart do not see a light move within so many pixels (median) of each other.
+SAME_PICTURE = 1.0
 
 
 def check_tracks(tracks: Tracks, cameras: tuple[CameraModel, ...] | None) -> None:
@@ -39,6 +42,7 @@ def check_tracks(tracks: Tracks, cameras: tuple[CameraModel, ...] | None) -> Non
                 f"{camera.size[0]} x {camera.size[1]}: are the lenses in the same order?"
             )
     seen = tracks.seen()
+    _refuse_copies(tracks, seen)
     lights = tracks.pixels.shape[2]
     for name, number in zip(tracks.names, seen.sum(axis=1), strict=True):
         if number * lights < FEWEST_COMMON:
@@ -52,6 +56,21 @@ def check_tracks(tracks: Tracks, cameras: tuple[CameraModel, ...] | None) -> Non
             f"the cameras fall into {len(groups)} groups that no light connects: {named}. "
             f"Move the light where a camera of each sees it together with one of another"
         )
+
+
+def _refuse_copies(tracks: Tracks, seen: NDArray[np.bool_]) -> None:
+    """Refuse one recording under two names: a camera that is not there would seem found."""
+    for a, b in combinations(range(len(tracks.names)), 2):
+        both = seen[a] & seen[b]
+        if tracks.sizes[a] != tracks.sizes[b] or not both.any():
+            continue
+        # The ends of a wand may be told apart in one and not in the other.
+        one, other = (tracks.pixels[c, both].mean(axis=1) for c in (a, b))
+        if float(np.median(np.linalg.norm(one - other, axis=-1))) < SAME_PICTURE:
+            raise UserError(
+                f"{tracks.names[a]} and {tracks.names[b]} show the light at the same pixels: "
+                "they are one camera's recording twice"
+            )
 
 
 def connected(linked: NDArray[np.bool_]) -> list[list[int]]:

@@ -13,30 +13,35 @@ from chromeball.calibrate.wand_result import WandRig
 def plot_wand(rig: WandRig, path: str | os.PathLike[str]) -> None:
     """Cameras with their fields of view and lights from above, and residuals by camera.
 
-    Above is the direction in which the cameras spread least.
+    The axes are the rig's own, in which its positions are printed.
     """
     figure = Figure(figsize=(11, 5.2), layout="constrained")
     plan, errors = figure.subplots(1, 2)
     points = rig.points[np.isfinite(rig.points).all(axis=-1)]
     everything = np.concatenate([rig.centres, points])
-    middle = everything.mean(axis=0)
-    across = _level(rig)
-    flat = (points - middle) @ across.T
+    right, away, flipped = _plan_axes(rig)
+    flat = points[:, [right, away]]
     plan.plot(*flat.T, ".", ms=1.5, color="0.6", label=f"{len(points)} lights")
     size = float(np.ptp(everything, axis=0).max()) / 12
     for name, camera in zip(rig.names, rig.cameras, strict=True):
         pose = camera.world_from_camera
-        (x, y), (dx, dy) = (
-            (pose.translation - middle) @ across.T,
-            across @ pose.rotation[:, 2],
-        )
+        x, y = pose.translation[[right, away]]
+        dx, dy = pose.rotation[[right, away], 2]
         plan.plot([x], [y], "o", ms=6)
         plan.annotate(
             "", (x + size * dx, y + size * dy), (x, y), arrowprops={"arrowstyle": "->"}
         )
-        plan.annotate(name, (x, y), xytext=(6, 6), textcoords="offset points", fontsize=8)
-    unit = "m" if rig.unit == "m" else f"unit: {rig.unit}"
-    plan.set(aspect="equal", xlabel=unit, title="From above")
+        plan.annotate(
+            name, (x, y), xytext=(0, 7), textcoords="offset points", ha="center", fontsize=8
+        )
+    unit = "m" if rig.unit == "m" else f"in the {rig.unit}"
+    plan.set(
+        aspect="equal", title="From above",
+        xlabel=f"{'xyz'[right]}, {unit}", ylabel=f"{'xyz'[away]}, {unit}",
+    )  # fmt: skip
+    if flipped:
+        plan.invert_yaxis()
+    plan.margins(0.15)
     plan.legend(loc="best", fontsize=8)
     for c, name in enumerate(rig.names):
         left = rig.residuals[c].reshape(-1, 2)
@@ -50,13 +55,13 @@ def plot_wand(rig: WandRig, path: str | os.PathLike[str]) -> None:
     figure.savefig(path, dpi=110, format="png")
 
 
-def _level(rig: WandRig) -> np.ndarray:
-    """Two directions of the plan, (2, 3): across the mean up of the cameras, image up away."""
+def _plan_axes(rig: WandRig) -> tuple[int, int, bool]:
+    """The rig's own axes to the right and upward in the plan, and whether the latter runs down.
+
+    The plan leaves out the axis nearest to the cameras' mean up, and is seen from above.
+    """
     up = -np.mean([c.world_from_camera.rotation[:, 1] for c in rig.cameras], axis=0)
-    if np.linalg.norm(up) < 0.2:  # cameras every way up
-        up = np.array([0.0, 1, 0])
-    up = up / np.linalg.norm(up)
-    helper = np.eye(3)[0] if abs(up[0]) < 0.9 else np.eye(3)[2]
-    x = helper - (helper @ up) * up
-    x /= np.linalg.norm(x)
-    return np.stack([x, np.cross(up, x)])
+    left_out = int(np.argmax(np.abs(up)))
+    right, away = (axis for axis in range(3) if axis != left_out)
+    toward_us = np.cross(np.eye(3)[right], np.eye(3)[away])[left_out]
+    return right, away, bool(toward_us * up[left_out] < 0)

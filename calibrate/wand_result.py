@@ -12,6 +12,9 @@ from chromeball.calibrate.wand_lens import lens_names
 from chromeball.scene.camera import CameraModel
 from chromeball.scene.pose import Pose
 
+#: Smaller delays, in frames, are those of cameras that run in step.
+IN_STEP = 0.01
+
 
 @dataclass(frozen=True)
 class Tracks:
@@ -78,6 +81,11 @@ class WandRig:
         """Standard errors of positions along the rig's axes, (C, 3)."""
         return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2)[:, 3:])
 
+    @property
+    def synchronous(self) -> bool:
+        """The cameras run in step."""
+        return bool(np.abs(self.delays).max() < IN_STEP)
+
     def camera_rms(self) -> NDArray[np.float64]:
         """RMS per light of each camera over its inliers, (C,)."""
         return np.sqrt(np.nanmean((self.residuals**2).sum(axis=-1), axis=(1, 2)))
@@ -114,7 +122,7 @@ class WandRig:
             "outliers": int(self.outliers.sum()),
             "condition": self.condition,
             "gauge": self.gauge(),
-            "synchronous": not self.delays.any(),
+            "synchronous": self.synchronous,
             "cameras": {
                 name: {
                     "position": camera.world_from_camera.translation,

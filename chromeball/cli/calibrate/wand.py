@@ -13,6 +13,7 @@ from chromeball.scene.record import Stage, atomic_output, check_output
 
 if TYPE_CHECKING:
     from chromeball.calibrate.wand_result import Tracks, WandRig
+    from chromeball.calibrate.wand_world import Survey
     from chromeball.scene.camera import CameraModel
 
 type Several = Annotated[list[Path] | None, Parameter(negative="", consume_multiple=True)]
@@ -107,7 +108,7 @@ def wand(
     }
     extra = [*(lens or ()), *([centres] if centres else ())]
     with Stage("calibrate wand", [*_files(sources, points), *extra], **options) as stage:
-        rate = None
+        rate, survey = None, None
         if points is not None:
             tracks = read_points(points)
         else:
@@ -122,15 +123,17 @@ def wand(
             synchronous=synchronous,
         )
         if centres is not None:
-            rig, left = as_surveyed(rig, read_centres(centres, len(tracks.names)))
-            stage.figures["centres_rms"] = left
+            rig, survey = as_surveyed(rig, read_centres(centres, len(tracks.names)))
+            stage.figures["centres"] = {
+                "rms": survey.rms, "misses": dict(zip(rig.names, survey.misses, strict=True))
+            }  # fmt: skip
         rig = _placed(rig, up, floor)
         stage.figures.update(rig.figures())
         with atomic_output(output / "rig.png") as temporary:
             plot_wand(rig, temporary)
         stage.figures["plots"] = {"rig": "rig.png"}
         write_rig(stage, output, rig)
-    for line in _advice(rig):
+    for line in _advice(rig, survey):
         say(line)
     if json:
         print_figures(stage.figures)
@@ -145,10 +148,16 @@ def wand(
         x, y, z = rig.centres[c]
         errors = ", ".join(f"{v * factor:.2g}" for v in rig.sigma_position[c])
         line = f"  {name}: at {x:.4f}, {y:.4f}, {z:.4f} +- {errors} {unit}"
-        if rig.delays.any():
+        if not rig.synchronous:
             line += f"; {rig.delays[c]:+.3f} +- {rig.delay_errors[c]:.2g} frames late"
             line += f" ({1000 * rig.delays[c] / rate:+.1f} ms)" if rate else ""
         print(line)
+    if survey is not None:
+        worst = int(survey.misses.argmax())
+        print(
+            f"from the centres given: {1000 * survey.rms:.2g} mm (RMS), most "
+            f"{rig.names[worst]}: {1000 * survey.misses[worst]:.2g} mm"
+        )
     print(f"{rig.gauge()}; lengths in {'metres' if metres else f'the {rig.unit}'}")
 
 
@@ -259,17 +268,26 @@ def _placed(rig: WandRig, up: str | None, floor: str | None) -> WandRig:
     return on_floor(rig, (one, two, three))
 
 
-def _advice(rig: WandRig) -> list[str]:
+def _advice(rig: WandRig, survey: Survey | None) -> list[str]:
     """What to do next, if anything."""
+    import numpy as np
+
     lines: list[str] = []
     if rig.unit != "m":
         lines.append(
             "nothing tells the scale: give --distance or --centres, or record two lights on a "
             "wand and give its length with --wand"
         )
-    if rig.delays.any():
+    if survey is not None and survey.doubtful is not None:
+        name, miss = rig.names[survey.doubtful], survey.misses[survey.doubtful]
         lines.append(
-            "the cameras are not synchronous; their delays are estimated. Bring rig.json's "
-            "delays to whatever uses them together"
+            f"{name} stands {1000 * miss:.2g} mm from its centre, without it the others fit "
+            "far better: check its line of --centres"
+        )
+    if not rig.synchronous:
+        most = float(np.abs(rig.delays).max())
+        lines.append(
+            f"the cameras are not synchronous, by up to {most:.3g} frames; the delays are "
+            "estimated. Bring rig.json's delays to whatever uses them together"
         )
     return lines
