@@ -150,6 +150,28 @@ def fit_model(
     return _settle(placed, estimate, board, corners, found, still)
 
 
+def place_views(
+    camera: CameraModel,
+    corners: NDArray[np.float64],
+    target: Target,
+    bow: NDArray[np.float64] | None = None,
+    pupil: NDArray[np.float64] | None = None,
+) -> tuple[NDArray[np.intp], Estimate]:
+    """Views (n,) of `corners` that have a pose before a known camera, and their poses.
+
+    `bow` (2,) of the board and travel of the `pupil` (2,) are those of :class:`Estimate`.
+    """
+    none = np.zeros(2)
+    start = Estimate(
+        camera,
+        none if bow is None else bow,
+        np.zeros((0, 3, 3)),
+        np.zeros((0, 3)),
+        none if pupil is None else pupil,
+    )
+    return _place(start, target.points(), corners, np.isfinite(corners[..., 0]), math.inf)
+
+
 def pose_residuals(
     camera: CameraModel,
     corners: NDArray[np.float64],
@@ -159,21 +181,11 @@ def pose_residuals(
 ) -> NDArray[np.float64]:
     """Residuals (V, rows, columns, 2) of views whose poses alone are fitted to a camera.
 
-    Projected minus observed; NaN where there is no corner, or no pose. `bow` (2,) of the board
-    and travel of the `pupil` (2,) are those of :class:`Estimate`.
+    Projected minus observed; NaN where there is no corner, or no pose.
     """
-    board, found = target.points(), np.isfinite(corners[..., 0])
-    none = np.zeros(2)
-    start = Estimate(
-        camera,
-        none if bow is None else bow,
-        np.zeros((0, 3, 3)),
-        np.zeros((0, 3)),
-        none if pupil is None else pupil,
-    )
-    placed, estimate = _place(start, board, corners, found, math.inf)
+    placed, estimate = place_views(camera, corners, target, bow, pupil)
     errors = np.full(corners.shape, np.nan)
-    errors[placed] = residuals(estimate, board, corners[placed])
+    errors[placed] = residuals(estimate, target.points(), corners[placed])
     return errors
 
 

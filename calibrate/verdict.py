@@ -26,6 +26,7 @@ from chromeball.calibrate.next_views import (
     knowledge,
     next_views,
 )
+from chromeball.calibrate.one_lens import Change, lens_change
 from chromeball.calibrate.regions import named, thirds
 from chromeball.calibrate.target import Target
 
@@ -41,10 +42,14 @@ ENOUGH_TILT = math.radians(20)
 MISFIT = 1.25
 #: A view of which more than this share of corners was rejected was misread, or moved.
 REJECTED = 0.15
+#: No verdict is good if more than this share of the views does not fit the lens.
+MISREAD = 0.1
 #: A board that bows by more than this share of its width is no parabola any more, either.
 BENT = 0.004
 #: Edges blurred by more than this, pixels, lose corners and some of their accuracy.
 BLURRED = 2.5
+#: So many views are named.
+NAMED = 3
 #: Cells of the picture across whose residuals are looked at together, and corners in one.
 CELLS, IN_CELL = 10, 8
 
@@ -100,18 +105,21 @@ def judge_lens(
     worse = excess if differ else 1.0
     systematic = pattern if repeated else 0.0
     error = np.hypot(worse * known.error(), systematic)
-    views = int(np.isfinite(lens.camera_from_board).all(axis=-1).sum())
+    misread = np.flatnonzero(~np.isfinite(lens.camera_from_board).all(axis=-1))
+    views = len(lens.camera_from_board) - len(misread)
     precision, share = _precision(error[shown])
     wide_enough = lens.tilt() >= ENOUGH_TILT
     bad = (error >= GOOD) & shown
     enough = float(np.mean(error[shown] < GOOD)) >= GOOD_SHARE
     # More views do not help where the model itself is not that good.
     few = max(0, ENOUGH_VIEWS - views, 0 if wide_enough else 3)
+    change = lens_change(lens, target)
     chosen, after = next_views(known, target, lit=shown, worse=worse, fewest=few)
-    if enough and not few:
+    if change is not None or (enough and not few):
         chosen, after = [], known
     good = enough and views >= ENOUGH_VIEWS and wide_enough
-    good &= not differ and not misfit > MISFIT
+    good &= not differ and not misfit > MISFIT and change is None
+    good &= len(misread) <= MISREAD * len(lens.camera_from_board)
     picture = "picture" if shown.all() else "lens's circle"
     sentence = (
         f"{'good' if precision <= GOOD else 'known'} to {precision:g} px over "
@@ -126,6 +134,12 @@ def judge_lens(
         ask = _count(len(chosen), "view") if where else _count(len(chosen), "more view")
         sentence += f": take {ask}{' there' if where else ''}"
     advice = _view_advice(chosen, error, flat, lens.camera.size)
+    if len(misread):
+        verb = "does" if len(misread) == 1 else "do"
+        sentence += f"; {len(misread)} of {len(lens.camera_from_board)} views {verb} not fit"
+    if change is not None:
+        sentence += f"; the lens changed before {_name(change.first, files)}"
+        advice.insert(0, _changed(change, len(lens.camera_from_board), files))
     if views < ENOUGH_VIEWS:
         sentence += f"; {_count(views, 'view')} {'is' if views == 1 else 'are'} few"
     if not wide_enough:
@@ -137,8 +151,8 @@ def judge_lens(
         sentence += f"; two halves of the views differ {excess:.1f} times more than their noise"
     elif misfit > MISFIT:
         sentence += f"; left-out views miss by {misfit:.1f} times what the noise explains"
-    advice += _other_advice(lens, target, files, blur)
-    if differ or misfit > MISFIT or systematic > GOOD / 2:
+    advice += _other_advice(lens, target, files, blur, changed=change is not None)
+    if change is None and (differ or misfit > MISFIT or systematic > GOOD / 2):
         advice.append(
             _systematic(excess if differ else math.nan, misfit, pattern, repeated, searched)
         )
@@ -146,6 +160,14 @@ def judge_lens(
         "good_px": precision,
         "good_share": share,
         "views": views,
+        "views_that_do_not_fit": len(misread),
+        "lens_change": None
+        if change is None
+        else {
+            "before": _name(change.first, files),
+            "magnification": change.magnification,
+            "error": change.error,
+        },
         "tilt_degrees": math.degrees(lens.tilt()),
         "seen_share": float(known.seen[shown].mean()),
         "common_residual_px": pattern,
@@ -257,19 +279,10 @@ def _view_advice(
 
 
 def _other_advice(
-    lens: Lens, target: Target, files: Sequence[str] | None, blur: float
+    lens: Lens, target: Target, files: Sequence[str] | None, blur: float, *, changed: bool
 ) -> list[str]:
-    """On views that were misread, a bent board and blur."""
-    lines: list[str] = []
-    found = np.isfinite(lens.observed[..., 0]).sum(axis=(1, 2))
-    rejected = lens.outliers.sum(axis=(1, 2))
-    for view in np.argsort(-rejected / np.maximum(found, 1))[:3]:
-        if rejected[view] > REJECTED * found[view]:
-            name = f"view {view}" if files is None else files[view]
-            lines.append(
-                f"take {name} again or leave it out: {rejected[view]} of its {found[view]} "
-                "corners do not fit (was the board misread, moving or bent?)"
-            )
+    """On views that were misread, a bent board and blur; a lens that changed explains views."""
+    lines = [] if changed else _misread_advice(lens, files)
     width = float(np.ptp(target.points()[..., :2].reshape(-1, 2), axis=0).max())
     bow = float(np.abs(lens.bow).max())
     if bow > BENT * width:
@@ -283,6 +296,41 @@ def _other_advice(
             "exposure, the board held still)"
         )
     return lines
+
+
+def _misread_advice(lens: Lens, files: Sequence[str] | None) -> list[str]:
+    """On views that do not fit, as a whole or in part."""
+    lines: list[str] = []
+    found = np.isfinite(lens.observed[..., 0]).sum(axis=(1, 2))
+    rejected = lens.outliers.sum(axis=(1, 2))
+    why = "was the board misread, moving or bent, or very near?"
+    posed = np.isfinite(lens.camera_from_board).all(axis=-1)
+    whole: list[int] = np.flatnonzero(~posed).tolist()
+    if whole:
+        names = ", ".join(_name(view, files) for view in whole[:NAMED])
+        more = f" and {len(whole) - NAMED} more" if len(whole) > NAMED else ""
+        they = "it does not fit and counts" if len(whole) == 1 else "they do not fit and count"
+        lines.append(f"take {names}{more} again or leave out: {they} for nothing ({why})")
+    share = np.where(posed, rejected / np.maximum(found, 1), 0.0)
+    for view in np.argsort(-share)[: min(NAMED, int((share > REJECTED).sum()))].tolist():
+        lines.append(
+            f"take {_name(view, files)} again or leave it out: {rejected[view]} of its "
+            f"{found[view]} corners do not fit ({why})"
+        )
+    return lines
+
+
+def _changed(change: Change, views: int, files: Sequence[str] | None) -> str:
+    """What a lens that changed midway asks for."""
+    return (
+        f"zoom or focus changed: from {_name(change.first, files)} on, the last "
+        f"{views - change.first} of {views} views, everything is {change.magnification:.4g} +- "
+        f"{change.error:.2g} times as large; calibrate the views before and after by themselves"
+    )
+
+
+def _name(view: int, files: Sequence[str] | None) -> str:
+    return f"view {view}" if files is None else files[view]
 
 
 def _systematic(

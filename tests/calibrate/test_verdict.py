@@ -15,6 +15,7 @@ from chromeball.calibrate.lens import calibrate_lens
 from chromeball.calibrate.lens_result import Lens
 from chromeball.calibrate.lit import brightest, lit_places
 from chromeball.calibrate.next_views import GOOD, candidates, knowledge, next_views, slants
+from chromeball.calibrate.one_lens import lens_change, magnifications
 from chromeball.calibrate.regions import named, thirds
 from chromeball.calibrate.solve import Fit, fit_start
 from chromeball.calibrate.target import Chessboard
@@ -224,6 +225,61 @@ def test_misread_views_bent_boards_and_blur_are_told(good: Lens) -> None:
     ]
     assert "18 of its 54" in advice[0]
     assert "1.5 mm out of 200 mm" in advice[1]
+
+
+def zoomed(factor: float, views: int, seed: int = 0) -> NDArray[np.float64]:
+    """Fourteen views, the last of which by a lens zoomed by `factor`."""
+    scale = np.array([factor, factor, 1, 1, 1, 1, 1, 1])
+    other = replace(CAMERA, intrinsics=CAMERA.intrinsics * scale)
+    first, last = (
+        project(BOARD, c, board_poses(BOARD, c, n, seed=seed + i), noise=NOISE, seed=seed + i)
+        for i, (c, n) in enumerate(((CAMERA, 14 - views), (other, views)))
+    )
+    return np.concatenate([first, last])
+
+
+@pytest.mark.parametrize(("factor", "views"), [(1.25, 4), (1.25, 7), (1.03, 7)])
+def test_a_lens_that_was_zoomed(factor: float, views: int) -> None:
+    """Where and by how much is told, and no more views are asked for."""
+    lens = lens_of(zoomed(factor, views))
+    change = lens_change(lens, BOARD)
+    assert change is not None
+    assert change.first == 14 - views
+    assert abs(change.magnification - factor) < 3 * change.error
+    assert change.error < 0.1 * factor
+    verdict = judge_lens(lens, BOARD, halves=compare_halves(lens, BOARD, "opencv4", start()))
+    assert not verdict.good
+    assert f"the lens changed before view {14 - views}" in verdict.sentence
+    assert "zoom or focus changed" in verdict.advice[0]
+    assert not verdict.views
+
+
+def test_one_lens_is_one() -> None:
+    """Magnifications are their errors apart, and chance is no change."""
+    off: list[float] = []
+    for seed in range(4):
+        lens = lens_of(zoomed(1.0, 7, 10 + 2 * seed))
+        found, errors = magnifications(lens, BOARD)
+        off += list(np.log(found) / errors)
+        assert lens_change(lens, BOARD) is None
+    assert 0.7 < float(np.sqrt(np.mean(np.square(off)))) < 1.3
+
+
+def test_views_that_do_not_fit_count(good: Lens) -> None:
+    poses, outliers = good.camera_from_board.copy(), good.outliers.copy()
+    poses[[1, 4]], outliers[[1, 4]] = np.nan, True
+    partial = replace(
+        good,
+        camera_from_board=poses,
+        outliers=outliers,
+        residuals=np.where(outliers[..., None], np.nan, good.residuals),
+    )
+    verdict = judge_lens(partial, BOARD)
+    assert f"2 of {len(poses)} views do not fit" in verdict.sentence
+    assert "take view 1, view 4 again or leave out" in verdict.advice[0]
+    assert verdict.good == (0.1 * len(poses) >= 2)
+    poses[: len(poses) // 5] = np.nan
+    assert not judge_lens(replace(partial, camera_from_board=poses), BOARD).good
 
 
 def test_slants_are_those_of_the_boards() -> None:

@@ -71,9 +71,14 @@ def solve_and_tell(
         **stage.figures,
         **lens.figures(),
         "judged_by": verdict.figures,
-        "views_used": len(used),
+        "views_used": verdict.figures["views"],
         "views_skipped": len(detections) - len(used),
         "skipped": [str(d.file) for d in detections if not d.usable],
+        "do_not_fit": [
+            file
+            for file, pose in zip(files, lens.camera_from_board, strict=True)
+            if not np.isfinite(pose).all()
+        ],
         "repeated": [str(d.file) for d in dropped],
         "chosen_model": chosen,
         "taken_with": taken_with(files),
@@ -98,7 +103,8 @@ def solve_and_tell(
     stage.figures["plots"] = plots
     with stage.output(output) as temporary:
         lens.write(temporary)
-    title = f"{output}: {chosen}, {len(used)} of {len(detections)} pictures"
+    fitting = verdict.figures["views"]
+    title = f"{output}: {chosen}, {fitting} of {len(detections)} pictures"
     return lambda json: print_figures(stage.figures) if json else _print(title, lens, verdict)
 
 
