@@ -14,6 +14,7 @@ from chromeball.calibrate.lens_result import Lens
 from chromeball.calibrate.solve import Fit, pose_residuals
 from chromeball.calibrate.target import Target
 from chromeball.calibrate.uncertainty import projection_slopes
+from chromeball.scene.camera import CameraModel
 
 #: Of calling noise an excess.
 RISK = 0.01
@@ -72,40 +73,58 @@ def compare_halves(
     pixels, _ = lens.uncertainty(columns)
     support = corners[posed][np.isfinite(corners[posed][..., 0])]
     support = support[np.linspace(0, len(support) - 1, min(len(support), 2000)).astype(int)]
-    difference = _difference(first, second, pixels, support)
-    there = _difference(first, second, support, support)
-    slopes = projection_slopes(
-        first.camera, first.camera.unproject(support), first.camera.unproject(support)
-    )
-    both = np.isfinite(there[..., 0]) & np.isfinite(slopes).all(axis=(1, 2))
-    # d = J x with x of covariance C: |d|^2 has mean tr(CJ'J) and, about, the law of chi-square
-    # with tr(A)^2 / tr(A^2) degrees of freedom, A = CJ'J (Satterthwaite 1946).
-    j = slopes[both].reshape(-1, slopes.shape[-1])
-    a = (first.covariance + second.covariance) @ (j.T @ j)
-    likely, freedom = float(np.trace(a)), float(np.trace(a) ** 2 / np.trace(a @ a))
+    covariance = first.covariance + second.covariance
+    _, excess, freedom = lens_excess(first.camera, second.camera, covariance, support)
     return Halves(
         pixels,
-        difference,
-        excess=math.sqrt(float((there[both] ** 2).sum()) / likely),
+        difference=lens_difference(first.camera, second.camera, pixels, support),
+        excess=excess,
         chance=math.sqrt(float(chi2.ppf(1 - RISK, freedom)) / freedom),
         held_out=held_out,
         misfit=math.sqrt(square / max(expected, 1e-30)),
     )
 
 
-def _difference(
-    first: Lens, second: Lens, pixels: NDArray[np.float64], support: NDArray[np.float64]
+def lens_excess(
+    first: CameraModel,
+    second: CameraModel,
+    covariance: NDArray[np.float64],
+    support: NDArray[np.float64],
+) -> tuple[float, float, float]:
+    """How far two lenses of one model are apart over pixels `support` (N, 2).
+
+    RMS distance in pixels; its multiple of what the `covariance` (k, k) of their difference
+    lets expect; and the degrees of freedom of that multiple's square.
+    """
+    there = lens_difference(first, second, support, support)
+    rays = first.unproject(support)
+    slopes = projection_slopes(first, rays, rays)
+    both = np.isfinite(there[..., 0]) & np.isfinite(slopes).all(axis=(1, 2))
+    # d = J x with x of covariance C: |d|^2 has mean tr(CJ'J) and, about, the law of chi-square
+    # with tr(A)^2 / tr(A^2) degrees of freedom, A = CJ'J (Satterthwaite 1946).
+    j = slopes[both].reshape(-1, slopes.shape[-1])
+    a = covariance @ (j.T @ j)
+    likely, freedom = float(np.trace(a)), float(np.trace(a) ** 2 / np.trace(a @ a))
+    square = float((there[both] ** 2).sum())
+    return math.sqrt(square / max(1, int(both.sum()))), math.sqrt(square / likely), freedom
+
+
+def lens_difference(
+    first: CameraModel,
+    second: CameraModel,
+    pixels: NDArray[np.float64],
+    support: NDArray[np.float64],
 ) -> NDArray[np.float64]:
     """Where `second` sees what `first` sees at `pixels`, less those, (..., 2).
 
     The turn between the two is that of least squares over the `support`, in pixels.
     """
-    a, b = first.camera.unproject(support), second.camera.unproject(support)
+    a, b = first.unproject(support), second.unproject(support)
     known = np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1)
     u, _, vt = np.linalg.svd(b[known].T @ a[known])  # Wahba's problem: b = R a
     turn = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
-    rays = first.camera.unproject(pixels)
+    rays = first.unproject(pixels)
     with np.errstate(invalid="ignore"):
-        back = np.linalg.norm(first.camera.project(rays) - pixels, axis=-1) < 0.1
-        seen = second.camera.project(rays @ turn.T)
+        back = np.linalg.norm(first.project(rays) - pixels, axis=-1) < 0.1
+        seen = second.project(rays @ turn.T)
     return np.where(back[..., None], seen - pixels, np.nan)

@@ -70,7 +70,9 @@ class Lens:
 
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write the ``.cameramodel``, with what mrcal's solution was made of."""
-        known = replace(self.camera, covariance=self.covariance, region=_closed(self.hull()))
+        known = replace(
+            self.camera, covariance=self.covariance, region=outline(self._used_corners())
+        )
         if self.solution is None:
             known.write(path)
             return
@@ -116,10 +118,7 @@ class Lens:
 
     def hull(self) -> NDArray[np.float32]:
         """Convex hull of the corners that were used, (N, 2), pixels."""
-        import cv2
-
-        seen = self._used_corners()
-        return np.asarray(cv2.convexHull(seen.astype(np.float32)), np.float32).reshape(-1, 2)
+        return outline(self._used_corners())[:-1]
 
     def tilt(self) -> float:
         """Largest angle between two boards, radians."""
@@ -194,8 +193,12 @@ class Lens:
         return rays
 
 
-def _closed(outline: NDArray[np.float32]) -> NDArray[np.float32]:
-    return np.concatenate([outline, outline[:1]])
+def outline(corners: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Convex hull of `corners` (N, 2), closed: its first point comes last again, (M, 2)."""
+    import cv2
+
+    hull = np.asarray(cv2.convexHull(corners.astype(np.float32)), np.float32).reshape(-1, 2)
+    return np.concatenate([hull, hull[:1]])
 
 
 def largest_tilt(camera_from_board: NDArray[np.float64]) -> float:

@@ -10,15 +10,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from chromeball.calibrate import rig_solve
-from chromeball.calibrate.lens_result import check_focal
-from chromeball.calibrate.rig_lenses import Alone, calibrate_alone, place_alone
+from chromeball.calibrate.lens_result import check_focal, outline
+from chromeball.calibrate.rig_lenses import (
+    DOUBTED_LENS,
+    WRONG_LENS,
+    Alone,
+    calibrate_alone,
+    off_own_lens,
+    place_alone,
+)
+from chromeball.calibrate.rig_result import RigSolution
 from chromeball.calibrate.rig_solve import Layout, RigEstimate
 from chromeball.calibrate.rig_start import (
     AGREES,
@@ -29,6 +37,7 @@ from chromeball.calibrate.rig_start import (
     start_rig,
 )
 from chromeball.calibrate.rig_sync import Sync, synchronise
+from chromeball.calibrate.solve import bounded
 from chromeball.calibrate.target import Target
 from chromeball.scene.camera import CameraModel
 from chromeball.scene.errors import UserError
@@ -40,76 +49,6 @@ DISAGREEMENT = 2.0
 WORTH = 0.8
 #: Reduced normal equations worse conditioned than this determine nothing.
 WORST_CONDITION = 1e13
-
-
-@dataclass(frozen=True)
-class RigSolution:
-    """C cameras before F instants of a board of R x K corners, and how well they are known.
-
-    ``cameras`` are posed, world_from_camera = rig_from_camera, the first at the origin.
-    ``covariance`` (6C, 6C): for each camera the turn about its own axes (radians) and its
-    position on the rig (metres), zero for the first. ``lens_covariance`` (k, k) of each lens,
-    zero for one that was given. ``observed`` (C, F, R, K, 2) and ``residuals``, projected minus
-    observed, NaN for outliers. ``sigma`` and ``alone`` (C,): deviation of a coordinate of a
-    corner here and in each camera by itself. ``rig_from_board`` (F, 4, 4), NaN where unknown.
-    ``turned`` (C, F): boards that were read from another end than their instant's.
-    ``repeated`` instants that show what an earlier one shows, and count for nothing.
-    ``condition`` of the reduced normal equations. ``sync`` where the cameras did not look at
-    once and the times are known.
-    """
-
-    names: tuple[str, ...]
-    cameras: tuple[CameraModel, ...]
-    covariance: NDArray[np.float64]
-    lens_covariance: tuple[NDArray[np.float64], ...]
-    bow: NDArray[np.float64]
-    observed: NDArray[np.float64]
-    residuals: NDArray[np.float64]
-    sigma: NDArray[np.float64]
-    alone: NDArray[np.float64]
-    rig_from_board: NDArray[np.float64]
-    turned: NDArray[np.bool_]
-    repeated: tuple[int, ...]
-    condition: float
-    sync: Sync | None
-
-    @property
-    def outliers(self) -> NDArray[np.bool_]:
-        """Corners that do not fit, (C, F, R, K)."""
-        return np.isfinite(self.observed[..., 0]) & np.isnan(self.residuals[..., 0])
-
-    @property
-    def rms(self) -> NDArray[np.float64]:
-        """RMS per corner of each camera over its inliers, pixels, (C,)."""
-        square = (self.residuals**2).sum(axis=-1)
-        return np.sqrt(np.nanmean(square.reshape(len(square), -1), axis=1))
-
-    @property
-    def disagreement(self) -> float:
-        """How many times less exact the cameras are together than alone."""
-        return float(np.median(self.sigma / self.alone))
-
-    @property
-    def common(self) -> NDArray[np.intp]:
-        """Instants that two cameras share, (C, C)."""
-        seen = np.isfinite(self.residuals[..., 0]).any(axis=(2, 3)).astype(np.intp)
-        return seen @ seen.T
-
-    @property
-    def position_errors(self) -> NDArray[np.float64]:
-        """Standard errors of the cameras' positions on the rig, metres, (C, 3)."""
-        return np.sqrt(np.diag(self.covariance)).reshape(-1, 6)[:, 3:]
-
-    @property
-    def turn_errors(self) -> NDArray[np.float64]:
-        """Standard errors of the cameras' turns about their own axes, radians, (C, 3)."""
-        return np.sqrt(np.diag(self.covariance)).reshape(-1, 6)[:, :3]
-
-    def misread(self) -> list[tuple[int, int]]:
-        """Camera and instant of views of which no corner fits."""
-        found = np.isfinite(self.observed[..., 0]).any(axis=(2, 3))
-        fits = np.isfinite(self.residuals[..., 0]).any(axis=(2, 3))
-        return [(int(c), int(v)) for c, v in np.argwhere(found & ~fits)]
 
 
 def calibrate_rig(
@@ -165,6 +104,8 @@ def calibrate_rig(
     for name, views, size, model in zip(names, corners, sizes, models, strict=True):
         alone.append(_alone(name, views, target, size, model, given.get(name)))
         say(f"{name}: {int(alone[-1].saw.sum())} boards, corner noise {alone[-1].sigma:.3f} px")
+        if name in given and not refine:
+            _check_given(name, views, target, alone[-1], say)
     saw = np.array([a.saw for a in alone])
     poses = np.array([a.camera_from_board for a in alone])
     cameras = [_open(a.camera) for a in alone]
@@ -229,7 +170,10 @@ def calibrate_rig(
     _check_connected(error, names)
     return RigSolution(
         names=tuple(names),
-        cameras=tuple(_posed(estimate, c, alone[c].camera) for c in range(len(names))),
+        cameras=tuple(
+            _posed(estimate, c, _known(alone[c].camera, estimate, c, lenses[c], corners, error))
+            for c in range(len(names))
+        ),
         covariance=_on_rig(estimate, covariance),
         lens_covariance=tuple(lenses),
         bow=estimate.bow,
@@ -291,6 +235,29 @@ def _alone(
             )
         )
     return _named(name, place_alone, corners, target, lens)
+
+
+def _check_given(
+    name: str,
+    corners: NDArray[np.float64],
+    target: Target,
+    alone: Alone,
+    say: Callable[[str], object],
+) -> None:
+    """Refuse a given lens that is not this camera's: one of its pictures' own is far off it."""
+    off, excess = off_own_lens(corners, target, alone)
+    if not (off > DOUBTED_LENS[0] and excess > DOUBTED_LENS[1]):
+        return
+    text = (
+        f"its given lens is {off:.2g} px off one of its pictures' own, {excess:.0f} times "
+        "what that is good to"
+    )
+    if off > WRONG_LENS[0] and excess > WRONG_LENS[1]:
+        raise UserError(
+            f"camera {name}: {text}: is it another camera's, or was zoom or focus changed? "
+            "leave --lens out, or --refine it"
+        )
+    say(f"{name}: {text}; --refine would adapt it")
 
 
 def _named[T](name: str, function: Callable[..., T], *arguments: Any) -> T:
@@ -361,21 +328,29 @@ def _check_connected(error: NDArray[np.float64], names: Sequence[str]) -> None:
         raise UserError(f"without misread boards {disconnected(names, seen @ seen.T)}")
 
 
-def _posed(estimate: RigEstimate, c: int, alone: CameraModel) -> CameraModel:
+def _known(
+    alone: CameraModel,
+    estimate: RigEstimate,
+    c: int,
+    covariance: NDArray[np.float64],
+    corners: NDArray[np.float64],
+    error: NDArray[np.float64],
+) -> CameraModel:
+    """The lens of camera `c` with its `covariance` and the region of its corners that fit.
+
+    A lens that was given and not refined stays as it is, with all that its file said.
+    """
+    camera = estimate.cameras[c]
+    if not covariance.any():
+        return alone
+    region = outline(corners[c][np.isfinite(error[c, ..., 0])])
+    return bounded(replace(camera, covariance=covariance, region=region))
+
+
+def _posed(estimate: RigEstimate, c: int, camera: CameraModel) -> CameraModel:
     u, _, vt = np.linalg.svd(estimate.rotations[c])  # rounding alone
     camera_from_rig = Pose(u @ vt, estimate.translations[c])
-    camera = replace(estimate.cameras[c], max_angle=alone.max_angle)
-    if camera.model == "kb4":
-        camera = replace(camera, max_angle=rising_until(camera))
     return camera.posed(camera_from_rig.inverse())
-
-
-def rising_until(camera: CameraModel) -> float:
-    """The angle where the radius of Kannala and Brandt's lens stops to grow, radians."""
-    theta = np.linspace(0, math.pi, 2000)
-    powers = np.stack([(2 * i + 1) * theta ** (2 * i) for i in range(5)], axis=-1)
-    falls = np.flatnonzero(powers @ np.concatenate([[1.0], camera.intrinsics[4:]]) <= 0)
-    return float(theta[falls[0] - 1]) if len(falls) else math.pi
 
 
 def _on_rig(estimate: RigEstimate, covariance: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -19,7 +19,7 @@ from chromeball.scene.pose import Pose
 from chromeball.scene.record import decode, write_json
 
 if TYPE_CHECKING:
-    from chromeball.calibrate.rig import RigSolution
+    from chromeball.calibrate.rig_result import RigSolution
 
 
 @dataclass(frozen=True)

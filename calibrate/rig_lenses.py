@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 from chromeball.calibrate.adjust import Estimate, residuals
 from chromeball.calibrate.choose import CANDIDATES as LENSES
 from chromeball.calibrate.choose import choose_model
+from chromeball.calibrate.halves import lens_excess
 from chromeball.calibrate.lens import FEWEST_VIEWS, OPENCV
 from chromeball.calibrate.rig_solve import FEWEST_CORNERS, OUTLIER
 from chromeball.calibrate.rig_start import place_boards
-from chromeball.calibrate.solve import FISHEYES, fit_model, fit_start, judge
+from chromeball.calibrate.solve import FISHEYES, Fit, fit_model, fit_start, judge
 from chromeball.calibrate.target import Target
 from chromeball.scene.camera import CameraModel
 from chromeball.scene.errors import UserError
@@ -30,6 +31,11 @@ MODELS = ("auto", "pinhole", *OPENCV, *FISHEYES)
 CANDIDATES = tuple(m for m in LENSES if m in MODELS)
 #: Views that the fit needs; they are taken evenly from the session.
 FIT_VIEWS = 24
+
+#: A lens of the pictures' own may be so many pixels and so many times its errors off a given
+#: one before that is doubted, and before it is another camera's or another zoom's. Two good
+#: calibrations of one real lens differ by three to six times their errors.
+DOUBTED_LENS, WRONG_LENS = (0.5, 4.0), (3.0, 8.0)
 
 type Corners = NDArray[np.float64]
 
@@ -96,6 +102,31 @@ def place_alone(corners: Corners, target: Target, camera: CameraModel) -> Alone:
     sigma = _sigma(residuals(estimate, board, corners[saw]), 6 * int(saw.sum()))
     none = np.zeros((len(camera.intrinsics), len(camera.intrinsics)))
     return Alone(camera, poses, saw, sigma, none)
+
+
+def off_own_lens(corners: Corners, target: Target, given: Alone) -> tuple[float, float]:
+    """How far the `given` lens is off one of the corners' own, of its model.
+
+    RMS distance over the corners in pixels, a turn apart, and its multiple of the own lens's
+    errors; NaN where the boards are too few, or not turned enough, to tell.
+    """
+    camera, views = given.camera, given.saw
+    own = camera.model in FISHEYES or camera.model.removeprefix("LENSMODEL_").lower() in OPENCV
+    if not own or views.sum() < FEWEST_VIEWS:
+        return math.nan, math.nan
+    placed, poses = np.flatnonzero(views), given.camera_from_board[views]
+    estimate = Estimate(camera, np.zeros(2), poses[:, :3, :3], poses[:, :3, 3])
+    used = np.isfinite(corners[placed][..., 0])
+    start = Fit(placed, estimate, used, 2.4 * given.sigma)
+    try:
+        fit = fit_model(start, corners, target, camera.model, travel=False)
+        lens = judge(fit, corners, target)
+    except UserError:
+        return math.nan, math.nan
+    support = corners[np.isfinite(lens.residuals[..., 0])]
+    support = support[:: 1 + len(support) // 2000]
+    off, excess, _ = lens_excess(lens.camera, camera, lens.covariance, support)
+    return off, excess
 
 
 def _sigma(error: Corners, unknowns: int) -> float:

@@ -135,11 +135,15 @@ class Unknowns:
 
 @dataclass(frozen=True)
 class Normal:
-    """Sparse normal equations, the shared unknowns first, then six for each instant."""
+    """Sparse normal equations, the shared unknowns first, then six for each instant.
+
+    ``scores`` (F, unknowns) are the parts of the gradient that each instant's corners have.
+    """
 
     matrix: Any
     gradient: Array
     shared: int
+    scores: Any
 
     def step(self, damping: float) -> tuple[Array, Array] | None:
         """Change of the shared (s,) and local (F, 6) unknowns; None where singular."""
@@ -157,13 +161,23 @@ class Normal:
         return change[: self.shared], change[self.shared :].reshape(-1, 6)
 
     def covariance(self) -> Array:
-        """Of the shared unknowns, (s, s), for unit weights."""
+        """Of the shared unknowns, (s, s), for unit weights; instants, not corners, are random.
+
+        What a parabola misses of the motion moves all corners of an instant at once: from the
+        corners' noise alone errors would come out many times too small. The errors are those
+        of scores that scatter from instant to instant (Liang and Zeger 1986), where larger.
+        """
         from scipy.sparse.linalg import splu
 
         size = self.matrix.shape[0]
         unit = np.zeros((size, self.shared))
         unit[: self.shared] = np.eye(self.shared)
-        return np.asarray(splu(self.matrix.tocsc()).solve(unit)[: self.shared], float)
+        columns = np.asarray(splu(self.matrix.tocsc()).solve(unit), float)
+        noise = columns[: self.shared]
+        moves = self.scores @ columns
+        scatter = np.sqrt((moves**2).sum(axis=0) / np.diag(noise))
+        larger = np.maximum(scatter, 1.0)
+        return larger[:, None] * noise * larger
 
 
 def adjust_motion(
@@ -260,9 +274,14 @@ def linearise(
     j = csr_array((data.ravel(), column.ravel(), starts), shape=(2 * count, size))
     w = np.repeat(weight, 2)
     matrix = (j.T @ j.multiply(w[:, None]).tocsr()).tocsr()
-    gradient = np.asarray(j.T @ (w * error.ravel()), float)
+    score = j.multiply((w * error.ravel())[:, None]).tocsr()
+    who = csr_array(
+        (np.ones(2 * count), (np.repeat(v, 2), np.arange(2 * count))), (instants, 2 * count)
+    )
+    scores = who @ score
+    gradient = np.asarray(scores.sum(axis=0), float).ravel()
     return cost if math.isfinite(cost) else math.inf, Normal(
-        _held(matrix, np.setdiff1d(np.arange(instants), v), s), gradient, s
+        _held(matrix, np.setdiff1d(np.arange(instants), v), s), gradient, s, scores
     )
 
 

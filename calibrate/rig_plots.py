@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 from numpy.typing import NDArray
 
-from chromeball.calibrate.rig import RigSolution
+from chromeball.calibrate.rig_result import RigSolution
 
 
 def plot_residuals(rig: RigSolution, path: str | os.PathLike[str]) -> None:

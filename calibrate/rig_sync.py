@@ -41,8 +41,9 @@ class Sync:
 
     ``motion`` is the rig with its moving board, ``used`` (N,) the corners of ``seen`` that fit,
     ``sigma`` (C,) deviations of a coordinate. ``covariance`` (6 (C - 1), 6 (C - 1)) of the
-    cameras' poses, exp(w) R and t + dt; ``offset_errors`` and ``readout_errors`` (C,) standard
-    errors in seconds, by the corners' noise or by how the session's halves differ, whichever is
+    cameras' poses, exp(w) R and t + dt, as instants scatter and the session's halves differ
+    where that is more than the corners' noise; ``offset_errors`` and ``readout_errors`` (C,)
+    standard errors in seconds, by the corners' noise or by how the halves differ, whichever is
     more: clocks that jitter are not the corners' noise. ``held_out`` are median distances over
     halves of the session whose board poses alone are fitted: without offsets, with them, and
     with read-outs; ``rolling`` says that read-outs were worth it. ``rms_before`` and ``rms``
@@ -106,6 +107,7 @@ def synchronise(
     covariance = linearise(motion, seen.only(used), unknowns, sigma)[1].covariance()
     cameras = len(share)
     poses, offsets = 6 * (cameras - 1), cameras - 1
+    covariance[:poses, :poses] *= _excess(first, second, covariance[:poses, :poses]) ** 2
     spread = np.sqrt(np.diag(covariance))
     return Sync(
         motion, seen, used, sigma, covariance[:poses, :poses],
@@ -119,6 +121,22 @@ def synchronise(
         ),
         held_out, rolling, rms(errors(still, seen)), rms(errors(motion, seen)),
     )  # fmt: skip
+
+
+def _excess(first: Motion, second: Motion, covariance: Array) -> float:
+    """How many times more than predicted the poses of two halves of the session differ.
+
+    What the parabolas miss of the motion is shared by many instants, and shows only here. The
+    difference of two halves has four times the variance of the whole; never less than one.
+    """
+    from scipy.spatial.transform import Rotation
+
+    turn = Rotation.from_matrix(
+        first.rig.rotations @ np.swapaxes(second.rig.rotations, 1, 2)
+    ).as_rotvec()
+    shift = first.rig.translations - second.rig.translations
+    off = np.concatenate([turn, shift], axis=1)[1:].ravel() / 2
+    return max(1.0, math.sqrt(float((off**2 / np.diag(covariance)).mean())))
 
 
 def rms(error: Array) -> float:
@@ -169,7 +187,8 @@ def _halves(
         learnt = _robust(motion, seen.only(half), unknowns, share, rounds=1)
         tested = seen.only(~half)
         fitted = _robust(learnt, tested, Unknowns(False, False, False), share, rounds=1)
-        left.append(distance(errors(fitted, tested)))
+        # Where the other half's cameras do not see a board at all, it is infinitely far.
+        left.append(np.nan_to_num(distance(errors(fitted, tested)), nan=math.inf))
         said.append(learnt)
     return float(np.median(np.concatenate(left))), (said[0], said[1])
 

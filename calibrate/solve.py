@@ -435,7 +435,7 @@ def judge(fit: Fit, corners: NDArray[np.float64], target: Target) -> Lens:
     poses = np.full((len(corners), 6), np.nan)
     poses[placed] = frames
     return Lens(
-        camera=_bounded(estimate.camera),
+        camera=bounded(estimate.camera),
         observed=corners,
         residuals=left,
         outliers=np.isfinite(corners[..., 0]) & np.isnan(left[..., 0]),
@@ -458,7 +458,7 @@ def board_frames(fit: Fit) -> NDArray[np.float64]:
     return np.concatenate([turns, estimate.translations], axis=1)
 
 
-def _bounded(camera: CameraModel) -> CameraModel:
+def bounded(camera: CameraModel) -> CameraModel:
     """The lens up to the angle where its radius stops to grow, as no real lens's does."""
     if not camera.model.startswith("kb4"):
         return camera

@@ -9,6 +9,9 @@ from chromeball.calibrate.adjust import gradients
 from chromeball.scene.camera import CameraModel
 from chromeball.scene.errors import UserError
 
+#: Places across and down the picture that are looked at.
+PLACES = 24
+
 
 def projection_covariance(
     camera: CameraModel,
@@ -59,6 +62,30 @@ def camera_uncertainty(camera: CameraModel, rays: NDArray[np.float64]) -> NDArra
     if camera.covariance is None or camera.region is None:
         raise UserError("the camera's file does not say how well it is known; calibrate it")
     return projection_covariance(camera, camera.covariance, _inside(camera), rays)
+
+
+def seen_places(camera: CameraModel) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Pixels (N, 2) over the picture, and whether corners told the lens there, (N,).
+
+    Raises
+    ------
+    UserError
+        When the file says nothing of the region that it was solved from.
+
+    """
+    import cv2
+
+    if camera.region is None:
+        raise UserError("the camera's file does not say where it is known; calibrate it")
+    width, height = camera.size
+    x, y = np.meshgrid(
+        (np.arange(PLACES) + 0.5) * width / PLACES - 0.5,
+        (np.arange(PLACES) + 0.5) * height / PLACES - 0.5,
+    )
+    pixels = np.stack([x.ravel(), y.ravel()], axis=-1)
+    region = camera.region.astype(np.float32)
+    inside = [cv2.pointPolygonTest(region, (u, v), False) >= 0 for u, v in pixels.tolist()]
+    return pixels, np.array(inside)
 
 
 def worst_direction(covariance: NDArray[np.float64]) -> NDArray[np.float64]:

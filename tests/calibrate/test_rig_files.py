@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from chromeball.calibrate.rig import RigSolution
 from chromeball.calibrate.rig_file import read_rig, rig_of, write_rig
+from chromeball.calibrate.rig_result import RigSolution
 from chromeball.calibrate.rig_views import Plan, Source, find_sources, plan_pairs
 from chromeball.calibrate.target import Chessboard
 from chromeball.calibrate.virtual import photograph

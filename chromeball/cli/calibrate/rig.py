@@ -13,8 +13,11 @@ from chromeball.scene.errors import UserError
 from chromeball.scene.record import Stage, atomic_output
 
 if TYPE_CHECKING:
-    from chromeball.calibrate.rig import RigSolution
+    from chromeball.calibrate.rig_result import RigSolution
     from chromeball.scene.camera import CameraModel
+
+#: Corners over less of the picture leave a lens to be completed.
+SEEN_ENOUGH = 0.6
 
 
 def rig(
@@ -157,6 +160,8 @@ def _ends(text: str | None, names: list[str]) -> tuple[str, str, float] | None:
 def _figures(solution: RigSolution, labels: tuple[str, ...]) -> dict[str, Any]:
     import numpy as np
 
+    from chromeball.calibrate.uncertainty import seen_places
+
     sync, names = solution.sync, solution.names
     square = (solution.residuals**2).sum(axis=-1)
     figures: dict[str, Any] = {
@@ -177,6 +182,11 @@ def _figures(solution: RigSolution, labels: tuple[str, ...]) -> dict[str, Any]:
         },
         "position_errors": dict(zip(names, solution.position_errors, strict=True)),
         "turn_errors_degrees": dict(zip(names, np.degrees(solution.turn_errors), strict=True)),
+        "lens_seen_share": {
+            name: float(seen_places(camera)[1].mean())
+            for name, camera in zip(names, solution.cameras, strict=True)
+            if camera.region is not None
+        },
         "bow_metres": solution.bow,
         "condition": solution.condition,
         "synchronised": sync is None and solution.disagreement <= 2,
@@ -209,6 +219,7 @@ def _advice(
         lines.append(
             f"boards that do not fit the others were left out: {', '.join(misread[:6])}{more}"
         )
+    lines += _open_lenses(solution, figures["lens_seen_share"])
     if solution.sync is None and solution.disagreement > 2:
         why = (
             "time offsets do not explain it: did the cameras move, or is a given lens wrong?"
@@ -232,6 +243,25 @@ def _advice(
                 "as large as --target says, or that length is wrong"
             )
         lines.append(text)
+    return lines
+
+
+def _open_lenses(solution: RigSolution, shares: dict[str, float]) -> list[str]:
+    """Cameras whose corners leave much of the picture open."""
+    from chromeball.calibrate.regions import named, thirds
+    from chromeball.calibrate.uncertainty import seen_places
+
+    lines: list[str] = []
+    for name, camera in zip(solution.names, solution.cameras, strict=True):
+        if shares.get(name, 1.0) >= SEEN_ENOUGH:
+            continue
+        pixels, seen = seen_places(camera)
+        where, _ = named(thirds(~seen, pixels, camera.size))
+        lines.append(
+            f"{name}: corners lie over {shares[name]:.0%} of its picture; beyond, in {where}, "
+            "its lens is a guess: show it the board there, or calibrate it by itself and give "
+            "--lens"
+        )
     return lines
 
 
