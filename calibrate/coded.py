@@ -9,6 +9,7 @@ of older OpenCV, with tags of another rim.
 from __future__ import annotations
 
 from dataclasses import replace
+from fractions import Fraction
 from functools import cache
 
 import cv2
@@ -33,19 +34,36 @@ type Coded = Charuco | AprilGrid
 
 def find_coded(picture: NDArray[np.uint8], target: Coded) -> tuple[Found, Printed]:
     """Corners of `target` in the order of its points, and how it was printed."""
-    places = target.points()[..., :2].reshape(-1, 2) / target.square
+    # In whole numbers, so that no picture is read otherwise for a length's last bit.
+    unit = _in_whole_numbers(target)
+    places = unit.points()[..., :2].reshape(-1, 2) / unit.square
     for inverted in (False, True):
         shown = np.asarray(255 - picture, np.uint8) if inverted else picture
-        for kind, markers in _boards(shown, target, thorough=not inverted):
+        for kind, markers in _boards(shown, unit, thorough=not inverted):
             known = kind.outlines()[markers.numbers].reshape(-1, 2)
             sides = np.linalg.norm(np.diff(markers.outlines, axis=1), axis=-1).mean()
             printed = Printed(kind, inverted)
             board = board_of(printed, float(sides) / _side(kind))
             found = grow(picture, board, places, known, markers.outlines.reshape(-1, 2))
             if np.isfinite(found.sigma).sum() >= FEWEST:
-                return found, printed
+                return found, Printed(_in_metres(kind, target), inverted)
     empty = np.full((len(places), 2), np.nan)
     return Found(empty, empty[:, 0], np.nan), Printed(target, False)
+
+
+def _in_whole_numbers(target: Coded) -> Coded:
+    """The board in a unit in which square and marker are whole numbers."""
+    if isinstance(target, AprilGrid):
+        return replace(target, square=1.0)
+    share = Fraction(repr(target.marker)) / Fraction(repr(target.square))
+    return replace(target, square=float(share.denominator), marker=float(share.numerator))
+
+
+def _in_metres(kind: Coded, target: Coded) -> Coded:
+    """The layout of `kind` in the lengths of `target`."""
+    if isinstance(kind, Charuco) and isinstance(target, Charuco):
+        return replace(kind, square=target.square, marker=target.marker)
+    return replace(kind, square=target.square)
 
 
 def is_mirrored(picture: NDArray[np.uint8], target: Coded) -> bool:

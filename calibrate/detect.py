@@ -41,6 +41,8 @@ FEWEST = 8
 SEARCH_WIDTH = 1600
 #: Pictures for each further process that are worth its start.
 WORTH = 4
+#: So many pictures are looked at for a board of other counts.
+TRIED = 4
 
 
 def detect_files(
@@ -80,9 +82,55 @@ def detect_files(
         )
         raise UserError(
             f"the board {target.spec} was not seen in {names}: "
-            "check its counts (a chessboard's are inner corners), focus and light"
+            f"{counts_hint(files, target)}, focus and light"
         )
     return detections
+
+
+def counts_hint(files: Sequence[str | os.PathLike[str]], target: Target) -> str:
+    """What to check of a board's counts that was not seen."""
+    seen = board_counts(files) if isinstance(target, Chessboard) else None
+    if isinstance(target, Chessboard) and seen and set(seen) != {target.columns, target.rows}:
+        return f"{_there(seen, target)}; else check its counts"
+    return "check its counts (a chessboard's are inner corners)"
+
+
+def larger_board(files: Sequence[str | os.PathLike[str]], target: Target) -> str:
+    """Told if the pictures show a larger chessboard than `target`, else nothing.
+
+    Any part of a board calibrates a lens; a rig's cameras must see the same one.
+    """
+    if not isinstance(target, Chessboard):
+        return ""
+    seen = board_counts(files)
+    counts = (max(target.columns, target.rows), min(target.columns, target.rows))
+    larger = seen is not None and seen != counts and min(np.subtract(seen, counts)) >= 0
+    return _there(seen, target) if seen and larger else ""
+
+
+def _there(seen: tuple[int, int], target: Chessboard) -> str:
+    return (
+        f"a chessboard of {seen[0]}x{seen[1]} inner corners is there: write "
+        f"chessboard:{seen[0]}x{seen[1]}:{target.square!r}"
+    )
+
+
+def board_counts(files: Sequence[str | os.PathLike[str]]) -> tuple[int, int] | None:
+    """Inner corners of the chessboard in most of some of the pictures, the larger first."""
+    some = list(files)[:: max(1, len(files) // TRIED)][:TRIED]
+    shown = [counts for f in some if (counts := other_counts(grey(read_image(f)))) is not None]
+    most = max(shown, key=shown.count, default=None)
+    return most if most is not None and shown.count(most) > len(some) / 2 else None
+
+
+def other_counts(picture: NDArray[np.uint8]) -> tuple[int, int] | None:
+    """Columns and rows of inner corners, the larger first, of whatever chessboard is there."""
+    if min(picture.shape) < 24:
+        return None
+    small = _shrink(picture, _search_scales(picture)[0])
+    flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_LARGER
+    found, _, kinds = cv2.findChessboardCornersSBWithMeta(small, (3, 3), flags)
+    return (max(kinds.shape), min(kinds.shape)) if found else None
 
 
 def _detections(

@@ -13,7 +13,14 @@ import pytest
 from numpy.typing import NDArray
 
 from chromeball.calibrate import detect_cache
-from chromeball.calibrate.detect import detect, detect_files, grey, judge, look
+from chromeball.calibrate.detect import (
+    detect,
+    detect_files,
+    grey,
+    judge,
+    larger_board,
+    look,
+)
 from chromeball.calibrate.target import Charuco, Chessboard, Target, parse_target
 from chromeball.calibrate.virtual import board_poses, photograph, project
 from chromeball.scene.camera import CameraModel
@@ -188,3 +195,31 @@ def test_cache_and_processes(tmp_path: Path) -> None:
     copy = write(tmp_path / "copy.png", picture)
     again = detect_files([copy], CHESSBOARD, cache=cache)[0]
     assert (again.file, again.verdict) == (copy, "kept")
+
+
+def test_a_length_in_metres_changes_no_detection() -> None:
+    """Boards of the same shape are read alike to the last bit, whatever their unit."""
+    board = Charuco(9, 6, 0.04, 0.03, "4X4_50")
+    pose = board_poses(board, CAMERA, 1, seed=3, size=0.3)[0]
+    picture = photograph(board, CAMERA, pose, blur=1.2, noise=3.0)
+    first = look(picture, board)
+    assert np.isfinite(first.corners).any()
+    for square, marker in ((0.08, 0.06), (0.1, 0.075), (0.7, 0.525)):
+        again = look(picture, replace(board, square=square, marker=marker))
+        np.testing.assert_array_equal(again.corners, first.corners)
+        assert again.printed.target == replace(board, square=square, marker=marker)
+    thirds = replace(board, square=0.03, marker=0.02)
+    shown = photograph(thirds, CAMERA, board_poses(thirds, CAMERA, 1, seed=3)[0])
+    assert np.isfinite(look(shown, thirds).corners).any()
+
+
+def test_counts_that_are_wrong_are_named(tmp_path: Path) -> None:
+    board = Chessboard(9, 6, 0.025)
+    files = [tmp_path / f"{i}.png" for i in range(3)]
+    for file, pose in zip(files, board_poses(board, CAMERA, 3, seed=1), strict=True):
+        cv2.imwrite(str(file), photograph(board, CAMERA, pose))
+    with pytest.raises(UserError, match="9x6 inner corners is there"):
+        detect_files(files, Chessboard(10, 7, 0.02))
+    assert "9x6 inner corners" in larger_board(files, Chessboard(8, 6, 0.025))
+    assert not larger_board(files, Chessboard(6, 9, 0.025))
+    assert not larger_board(files, Chessboard(10, 6, 0.025))

@@ -10,7 +10,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import Progress
 
-from chromeball.calibrate.detect import detect_files
+from chromeball.calibrate.detect import detect_files, larger_board
 from chromeball.calibrate.detect_cache import default_folder
 from chromeball.calibrate.detection import Detection
 from chromeball.calibrate.target import Target
@@ -28,13 +28,16 @@ def detect_told(images: Sequence[Path], target: Target, cache: bool) -> list[Det
             say(f"{detection.file}: {detection.verdict}")
             bar.advance(row)
 
-        return detect_files(
+        detections = detect_files(
             images,
             target,
             tell,
             workers=os.process_cpu_count() or 1,
             cache=_writable(default_folder()) if cache else None,
         )
+    if larger := larger_board([d.file for d in detections if d.usable], target):
+        say(f"{larger}; the part that was named is used")
+    return detections
 
 
 def _writable(folder: Path) -> Path | None:

@@ -66,6 +66,7 @@ def rig(
         Print the figures as JSON.
 
     """
+    from chromeball.calibrate.detect import larger_board
     from chromeball.calibrate.rig import calibrate_rig
     from chromeball.calibrate.rig_file import rig_of, write_rig
     from chromeball.calibrate.rig_lenses import MODELS
@@ -93,6 +94,9 @@ def rig(
     }  # fmt: skip
     with Stage("calibrate rig", inputs, **options) as stage:
         plan = plan_pairs(sources, times, every)
+        files = [file for source in sources for file in source.files]
+        if larger := larger_board(files, board):
+            raise UserError(f"{larger}; the cameras must all see the same corners")
         views = look(sources, plan, board, progress=say)
         solution = calibrate_rig(
             views.corners, board, views.sizes, names,

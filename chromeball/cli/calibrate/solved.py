@@ -123,8 +123,9 @@ def _told(second: SecondLook) -> dict[str, Any]:
     """The second look's figures, said if it found anything."""
     if second.won:
         verb = "kept" if second.kept else "not kept"
+        noun = "corner" if second.won == 1 else "corners"
         say(
-            f"second look: {second.won} more corners, {verb}: held-out error "
+            f"second look: {second.won} more {noun}, {verb}: held-out error "
             f"{second.before:.3f} px without, {second.after:.3f} px with them"
         )
     return {
