@@ -16,8 +16,8 @@ from bench.row import Row
 from chromeball.calibrate.choose import pose_errors, view_errors
 from chromeball.calibrate.detect import detect_files
 from chromeball.calibrate.lens import calibrate_lens
-from chromeball.calibrate.solve import pose_residuals
 from chromeball.calibrate.target import Chessboard
+from chromeball.calibrate.view_poses import pose_residuals
 from chromeball.calibrate.virtual import project, surrounding_poses
 from chromeball.scene.camera import CameraModel
 from chromeball.scene.errors import UserError

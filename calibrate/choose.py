@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from chromeball.calibrate.lens import FEWEST_VIEWS, calibrate_lens, check_views
 from chromeball.calibrate.lens_result import Lens
-from chromeball.calibrate.solve import Fit, fit_start, pose_residuals
+from chromeball.calibrate.solve import Fit, fit_start
 from chromeball.calibrate.target import Target
+from chromeball.calibrate.view_poses import pose_residuals
 from chromeball.scene.errors import UserError
 
 #: What `auto` chooses from, the simplest first.

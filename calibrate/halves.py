@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from chromeball.calibrate.choose import view_errors
 from chromeball.calibrate.lens import calibrate_lens
 from chromeball.calibrate.lens_result import Lens
-from chromeball.calibrate.solve import Fit, pose_residuals
+from chromeball.calibrate.solve import Fit
 from chromeball.calibrate.target import Target
 from chromeball.calibrate.uncertainty import projection_slopes
+from chromeball.calibrate.view_poses import pose_residuals
 from chromeball.scene.camera import CameraModel
 
 #: Of calling noise an excess.

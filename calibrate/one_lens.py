@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from chromeball.calibrate.adjust import Estimate, residuals
 from chromeball.calibrate.lens_result import Lens
-from chromeball.calibrate.solve import FEWEST_CORNERS, place_views
 from chromeball.calibrate.target import Target
+from chromeball.calibrate.view_poses import FEWEST_CORNERS, place_views
 from chromeball.scene.pose import Pose
 
 #: A change counts where it is so many of its standard errors, although the best of all places

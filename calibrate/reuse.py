@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chromeball.calibrate.choose import view_errors
-from chromeball.calibrate.solve import pose_residuals
 from chromeball.calibrate.target import Target
+from chromeball.calibrate.view_poses import pose_residuals
 from chromeball.scene.camera import CameraModel
 from chromeball.scene.image import positive, read_header
 

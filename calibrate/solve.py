@@ -1,10 +1,10 @@
 """One lens of any model by our own least squares; no focal length is asked for.
 
-Lenses of many fields of view are tried as a start, each board posed by its rays turned to the
-axis (:func:`chromeball.calibrate.board_pose.board_poses`), which holds beyond 90 degrees. The
-start is Kannala and Brandt's lens (2006), which bends to any other; the model asked for begins
-as the nearest to it. Everything is estimated together, the board's bow included: with Cauchy's
-weights first, then by least squares on the corners that fit.
+Lenses of many fields of view are tried as a start, each board posed by its rays
+(:mod:`chromeball.calibrate.view_poses`), which holds beyond 90 degrees. The start is Kannala
+and Brandt's lens (2006), which bends to any other; the model asked for begins as the nearest to
+it. Everything is estimated together, the board's bow included: with Cauchy's weights first,
+then by least squares on the corners that fit.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ from chromeball.calibrate.adjust import (
     covariance,
     residuals,
 )
-from chromeball.calibrate.board_pose import board_poses
 from chromeball.calibrate.convert import converted, parameters
 from chromeball.calibrate.lens_result import (
     LEAST_TILT,
@@ -32,9 +31,9 @@ from chromeball.calibrate.lens_result import (
     largest_tilt,
 )
 from chromeball.calibrate.target import Target
+from chromeball.calibrate.view_poses import FEWEST_CORNERS, cauchy_scale, distance, place
 from chromeball.scene.camera import CameraModel
 from chromeball.scene.errors import UserError
-from chromeball.scene.pose import Pose
 
 FISHEYES = ("kb4", "kb4_decentred", "equidistant", "equisolid", "stereographic")
 #: Fields of view across the longer side tried as a start, degrees.
@@ -56,11 +55,8 @@ PUPIL_SHARE, PUPIL_SQUARES = 0.03, 30.0
 OUTLIER = 4.0
 #: A view of which fewer corners than this share fit was misread, and counts for nothing.
 LEAST_SHARE = 0.4
-FEWEST_CORNERS = 6
 #: Unknowns of the start: focal lengths and centre; the lens; lens and bow.
 CORE, LENS, BOWED = (np.arange(12) < count for count in (4, 8, 10))
-#: The second pose of a board is a rival of the first up to so many times its error.
-RIVAL = 5.0
 UNEXPLAINED = "no lens explains where the corners lie: is the board's size right?"
 
 
@@ -95,21 +91,21 @@ def fit_start(corners: NDArray[np.float64], target: Target, size: tuple[int, int
     board, found = target.points(), np.isfinite(corners[..., 0])
     few, first = (_spread(len(corners), n) for n in (START_VIEWS, SEARCH_VIEWS))
     estimate = _start(board, corners[first], found[first], size)
-    placed, estimate = _place(estimate, board, corners[few], found[few], None)
+    placed, estimate = place(estimate, board, corners[few], found[few], None)
     placed = few[placed]
     if len(placed) < 3:
         raise UserError(UNEXPLAINED)
     for free in (CORE, LENS, BOWED):
         estimate = _robust(estimate, board, corners[placed], found[placed], free)
     # Boards that had no pose, or the wrong one of two, get theirs from the lens as it is now.
-    scale = _scale(residuals(estimate, board, corners[placed]))
-    placed, estimate = _place(estimate, board, corners, found, scale)
+    scale = cauchy_scale(residuals(estimate, board, corners[placed]))
+    placed, estimate = place(estimate, board, corners, found, scale)
     if len(placed) < 3:
         raise UserError(UNEXPLAINED)
     estimate = _robust(estimate, board, corners[placed], found[placed], BOWED)
     error = residuals(estimate, board, corners[placed])
-    scale = _scale(error)
-    return Fit(placed, estimate, found[placed] & (_distance(error) < 3 * scale), scale)
+    scale = cauchy_scale(error)
+    return Fit(placed, estimate, found[placed] & (distance(error) < 3 * scale), scale)
 
 
 def fit_model(
@@ -136,7 +132,7 @@ def fit_model(
     if model != estimate.camera.model:
         camera, _ = converted(estimate.camera, model, start.rays(board))
         estimate = replace(estimate, camera=camera)
-    placed, estimate = _place(estimate, board, corners, found, start.scale)
+    placed, estimate = place(estimate, board, corners, found, start.scale)
     if len(placed) < 3:
         raise UserError(UNEXPLAINED)
     estimate = replace(estimate, pupil=np.zeros(2))
@@ -148,45 +144,6 @@ def fit_model(
         if _earned(estimate, moving, board, corners[placed]):
             return _settle(placed, moving, board, corners, found, still | True)
     return _settle(placed, estimate, board, corners, found, still)
-
-
-def place_views(
-    camera: CameraModel,
-    corners: NDArray[np.float64],
-    target: Target,
-    bow: NDArray[np.float64] | None = None,
-    pupil: NDArray[np.float64] | None = None,
-) -> tuple[NDArray[np.intp], Estimate]:
-    """Views (n,) of `corners` that have a pose before a known camera, and their poses.
-
-    `bow` (2,) of the board and travel of the `pupil` (2,) are those of :class:`Estimate`.
-    """
-    none = np.zeros(2)
-    start = Estimate(
-        camera,
-        none if bow is None else bow,
-        np.zeros((0, 3, 3)),
-        np.zeros((0, 3)),
-        none if pupil is None else pupil,
-    )
-    return _place(start, target.points(), corners, np.isfinite(corners[..., 0]), math.inf)
-
-
-def pose_residuals(
-    camera: CameraModel,
-    corners: NDArray[np.float64],
-    target: Target,
-    bow: NDArray[np.float64] | None = None,
-    pupil: NDArray[np.float64] | None = None,
-) -> NDArray[np.float64]:
-    """Residuals (V, rows, columns, 2) of views whose poses alone are fitted to a camera.
-
-    Projected minus observed; NaN where there is no corner, or no pose.
-    """
-    placed, estimate = place_views(camera, corners, target, bow, pupil)
-    errors = np.full(corners.shape, np.nan)
-    errors[placed] = residuals(estimate, target.points(), corners[placed])
-    return errors
 
 
 # ---- stages of the solution
@@ -210,9 +167,9 @@ def _start(
     """
 
     def median(estimate: Estimate, placed: NDArray[np.intp]) -> float:
-        distance = np.full(found.shape, math.inf)
-        distance[placed] = _distance(residuals(estimate, board, corners[placed]))
-        return float(np.median(distance[found]))
+        far = np.full(found.shape, math.inf)
+        far[placed] = distance(residuals(estimate, board, corners[placed]))
+        return float(np.median(far[found]))
 
     tried: list[tuple[float, NDArray[np.intp], Estimate]] = []
     for degrees in FIELDS_OF_VIEW:
@@ -220,7 +177,7 @@ def _start(
         core = np.array([f, f, (size[0] - 1) / 2, (size[1] - 1) / 2, 0, 0, 0, 0])
         camera = CameraModel("kb4", core, size)
         start = Estimate(camera, np.zeros(2), np.zeros((0, 3, 3)), np.zeros((0, 3)))
-        placed, estimate = _place(start, board, corners, found, None)
+        placed, estimate = place(start, board, corners, found, None)
         if len(placed) >= 3:
             tried.append((median(estimate, placed), placed, estimate))
     if not tried:
@@ -231,98 +188,6 @@ def _start(
         estimate = _robust(start, board, corners[placed], found[placed], CORE, rounds=2)
         bent.append((median(estimate, placed), estimate))
     return min(bent, key=lambda lens: lens[0])[1]
-
-
-def _place(
-    estimate: Estimate,
-    board: NDArray[np.float64],
-    corners: NDArray[np.float64],
-    found: NDArray[np.bool_],
-    scale: float | None,
-) -> tuple[NDArray[np.intp], Estimate]:
-    """Views that have a pose, and their poses by their rays through the lens as it is.
-
-    Of the two poses that a plane allows the better one is taken: by rays, or with a `scale` of
-    Cauchy's by pixels, refined.
-    """
-    placed: list[int] = []
-    poses: list[list[Pose]] = []
-    for view, (pixels, seen) in enumerate(zip(corners, found, strict=True)):
-        rays = estimate.camera.unproject(pixels[seen])
-        reached = np.isfinite(rays).all(axis=-1)
-        points, rays = board[seen][reached], rays[reached]
-        if len(rays) < FEWEST_CORNERS:
-            continue
-        candidates = board_poses(points, rays)
-        if not candidates:
-            continue
-        misses = [_miss(pose.apply(points), rays) for pose in candidates]
-        order = np.argsort(misses)
-        likely = [candidates[i] for i in order if misses[i] <= min(misses) * RIVAL**2]
-        placed.append(view)
-        poses.append(likely if scale is not None else likely[:1])
-    chosen = np.array(placed, np.intp)
-    best = _at(estimate, [p[0] for p in poses])
-    if scale is None:
-        return chosen, best
-    best, left = _refined(best, board, corners[chosen], found[chosen], scale)
-    rivals = np.array([len(p) > 1 for p in poses], bool)
-    if rivals.any():
-        there = chosen[rivals]
-        other = _at(estimate, [p[1] for p in poses if len(p) > 1])
-        other, theirs = _refined(other, board, corners[there], found[there], scale)
-        better = theirs < left[rivals]
-        turn, shift = best.rotations.copy(), best.translations.copy()
-        turn[np.flatnonzero(rivals)[better]] = other.rotations[better]
-        shift[np.flatnonzero(rivals)[better]] = other.translations[better]
-        best = replace(best, rotations=turn, translations=shift)
-    return chosen, best
-
-
-def _at(estimate: Estimate, poses: list[Pose]) -> Estimate:
-    """The same lens before boards at `poses`."""
-    rotations = np.array([p.rotation for p in poses]).reshape(-1, 3, 3)
-    translations = np.array([p.translation for p in poses]).reshape(-1, 3)
-    return replace(estimate, rotations=rotations, translations=translations)
-
-
-def _miss(points: NDArray[np.float64], rays: NDArray[np.float64]) -> float:
-    """Median distance between unit directions."""
-    unit = points / np.linalg.norm(points, axis=-1, keepdims=True)
-    return float(np.median(((unit - rays) ** 2).sum(axis=-1)))
-
-
-def _refined(
-    estimate: Estimate,
-    board: NDArray[np.float64],
-    corners: NDArray[np.float64],
-    found: NDArray[np.bool_],
-    scale: float,
-) -> tuple[Estimate, NDArray[np.float64]]:
-    """Poses fitted to their pixels, and what is left of each view: a robust sum of squares."""
-    none = np.zeros(len(estimate.camera.intrinsics) + 4)
-    # A pose that the lens cannot see is no rival, and must not keep the others from moving.
-    seen = np.isfinite(residuals(estimate, board, corners)[..., 0])
-    whole = (seen | ~found).all(axis=(1, 2))
-    left = np.full(len(corners), math.inf)
-    if whole.any():
-        moved = adjust(
-            estimate.views(whole),
-            board,
-            corners[whole],
-            found[whole],
-            free=none > 0,
-            precision=none,
-            scale=scale,
-        )
-        u, _, vt = np.linalg.svd(moved.rotations)  # rounding alone
-        turn, shift = estimate.rotations.copy(), estimate.translations.copy()
-        turn[whole], shift[whole] = u @ vt, moved.translations
-        estimate = replace(estimate, rotations=turn, translations=shift)
-        square = (residuals(estimate, board, corners)[whole] ** 2).sum(axis=-1)
-        cost = square if math.isinf(scale) else np.log1p(square / scale**2)
-        left[whole] = np.where(found[whole], cost, 0.0).sum(axis=(1, 2))
-    return estimate, left
 
 
 def _robust(
@@ -336,7 +201,7 @@ def _robust(
     """Cauchy's estimate, its scale renewed from the residuals."""
     for _ in range(rounds):
         error = residuals(estimate, board, corners)
-        scale = _scale(error)
+        scale = cauchy_scale(error)
         estimate = adjust(
             estimate,
             board,
@@ -355,8 +220,8 @@ def _earned(
     still: Estimate, moving: Estimate, board: NDArray[np.float64], corners: NDArray[np.float64]
 ) -> bool:
     """Whether a travelling pupil explains clearly more than one that stands."""
-    a, b = (_distance(residuals(e, board, corners)) for e in (still, moving))
-    scale = _scale(residuals(moving, board, corners))
+    a, b = (distance(residuals(e, board, corners)) for e in (still, moving))
+    scale = cauchy_scale(residuals(moving, board, corners))
     seen = np.isfinite(a) & np.isfinite(b)
     cost, less = (float(np.log1p((d[seen] / scale) ** 2).sum()) for d in (a, b))
     squares = (cost - less) * 2.4**2
@@ -375,7 +240,7 @@ def _settle(
     used = np.zeros(found[placed].shape, bool)
     sigma = 0.0
     for turn in range(10):
-        error = _distance(residuals(estimate, board, corners[placed]))
+        error = distance(residuals(estimate, board, corners[placed]))
         if turn == 0:
             sigma = float(np.nanmedian(error)) / math.sqrt(2 * math.log(2))
         fits = found[placed] & (error < OUTLIER * sigma)
@@ -490,13 +355,3 @@ def _sigma(error: NDArray[np.float64], estimate: Estimate) -> float:
     if error.size <= unknowns:
         raise UserError("after outlier rejection too few corners are left: check the pictures")
     return max(math.sqrt(float((error**2).sum()) / (error.size - unknowns)), 1e-9)
-
-
-def _scale(error: NDArray[np.float64]) -> float:
-    """Cauchy's scale, 2.4 deviations of a coordinate by the median distance."""
-    median = float(np.nanmedian(_distance(error)))
-    return max(2.4 * median / math.sqrt(2 * math.log(2)), 1e-9)
-
-
-def _distance(error: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.hypot(error[..., 0], error[..., 1])

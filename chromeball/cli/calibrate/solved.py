@@ -37,6 +37,9 @@ from chromeball.scene.errors import UserError
 from chromeball.scene.image import read_image
 from chromeball.scene.record import Stage, atomic_output
 
+#: The pupil's travel is told for rays so far from the axis, radians.
+EDGE = math.radians(60)
+
 
 def solve_and_tell(
     stage: Stage, detections: Sequence[Detection], board: Target, model: str, output: Path
@@ -200,6 +203,12 @@ def _print(title: str, lens: Lens, verdict: Verdict) -> None:
         zip(lens.names, lens.camera.intrinsics, lens.standard_errors, strict=True)
     )[:12]:
         print(f"  {name:3} {value:12.6g} +- {error:.2g}")
+    if lens.pupil.any():
+        travel = 1000 * float(lens.pupil @ [EDGE**2, EDGE**4])
+        print(
+            f"entrance pupil moves along the axis by {travel:.2g} mm towards rays of "
+            f"{math.degrees(EDGE):.0f} degrees"
+        )
     flat, true = (
         " x ".join("beyond the model" if math.isnan(v) else f"{math.degrees(v):.2f}" for v in f)
         for f in (lens.field_of_view(), lens.true_field_of_view())
