@@ -81,8 +81,8 @@ def test_levels_by_parity() -> None:
                 sigma=True,
             )
             assert alone.sigma is not None
-            np.testing.assert_array_equal(whole.radiance[r::2, c::2], alone.radiance)
-            np.testing.assert_array_equal(whole.sigma[r::2, c::2], alone.sigma)
+            np.testing.assert_array_max_ulp(whole.radiance[r::2, c::2], alone.radiance, maxulp=2)
+            np.testing.assert_array_max_ulp(whole.sigma[r::2, c::2], alone.sigma, maxulp=2)
             np.testing.assert_array_equal(whole.clipped[r::2, c::2], alone.clipped)
 
 
@@ -95,8 +95,9 @@ def test_depths_agree() -> None:
     levels: dict[str, Any] = {"black": 700.0, "white": 60000.0, "sigma": True}
     a = merge_linear(sensor, TIMES, **levels)
     b = merge_linear([f.astype(np.float32) for f in sensor], TIMES, **levels)
-    np.testing.assert_array_equal(a.radiance, b.radiance)
-    np.testing.assert_array_equal(a.sigma, b.sigma)
+    # The compiler may contract a kernel's ends of rows otherwise than their middles.
+    np.testing.assert_array_max_ulp(a.radiance, b.radiance, maxulp=2)
+    np.testing.assert_array_max_ulp(a.sigma, b.sigma, maxulp=2)
 
     frames = photograph(picture)
     small = Response.from_log_exposure(np.stack([log_exposure()] * 3))
