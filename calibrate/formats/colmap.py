@@ -79,7 +79,7 @@ _STEMS = ("cameras", "images", "rigs", "frames", "points3D")
 def read(path: Path, hints: Hints) -> list[NamedCamera]:
     """A camera for each image of a model, named as that; without images those of its rigs.
 
-    `path` is the folder or one of its files.
+    `path` is the folder or one of its files; the file of rigs gives the cameras of its rig.
 
     Raises
     ------
@@ -111,7 +111,7 @@ def read(path: Path, hints: Hints) -> list[NamedCamera]:
     cameras, images, rigs = parts
     if not cameras:
         raise UserError("no cameras in it", file=folder / f"cameras{suffix}")
-    return _named(cameras, images, rigs, folder)
+    return _named(cameras, {} if path.stem == "rigs" else images, rigs, folder)
 
 
 type _Lenses = dict[int, tuple[CameraModel, Loss | None]]
@@ -144,9 +144,12 @@ def _named(
 # ---- lenses
 
 
-def _lens(
+def lens_of(
     model: str, size: tuple[int, int], params: NDArray[np.float64]
 ) -> tuple[CameraModel, Loss | None]:
+    """A lens by COLMAP's name and parameters; ValueError for none of its own."""
+    if model not in _COUNTS:
+        raise ValueError(f"COLMAP has no lens {model[:40]!r}")
     if len(params) != _COUNTS[model]:
         raise ValueError(f"{model} has {_COUNTS[model]} parameters, not {len(params)}")
     if model == "EQUIRECTANGULAR":
@@ -220,10 +223,8 @@ def _text_cameras(text: str) -> _Lenses:
     found: _Lenses = {}
     for words in _lines(text):
         key, model, width, height, *params = words
-        if model not in _COUNTS:
-            raise ValueError(f"COLMAP has no lens {model[:40]!r}")
         size = picture_size(width, height)
-        found[int(key)] = _lens(model, size, np.array([number(p) for p in params], float))
+        found[int(key)] = lens_of(model, size, np.array([number(p) for p in params], float))
     return found
 
 
@@ -236,7 +237,7 @@ def _text_images(text: str) -> dict[int, _Image]:
         words = line.split(maxsplit=9)
         if len(words) < 10:
             raise ValueError("a line of an image has ten words")
-        pose = _pose(numbers(list(words[1:8])))
+        pose = pose_of(numbers(list(words[1:8])))
         found[int(words[0])] = _Image(pose, int(words[8]), words[9].strip())
         next(lines, None)  # its points
     return found
@@ -251,14 +252,14 @@ def _text_rigs(text: str) -> _Rigs:
             kind, sensor = next(rest, ""), int(next(rest, ""))
             pose = Pose.identity()
             if index and int(next(rest, "")):
-                pose = _pose(numbers([next(rest, "") for _ in range(7)]))
+                pose = pose_of(numbers([next(rest, "") for _ in range(7)]))
             if kind == "CAMERA":
                 rig[sensor] = pose
         found.append(rig)
     return found
 
 
-def _pose(values: NDArray[np.float64]) -> Pose:
+def pose_of(values: NDArray[np.float64]) -> Pose:
     """From a quaternion, w first, and a translation."""
     norm = float(np.linalg.norm(values[:4]))
     if norm < 1e-9:
@@ -327,7 +328,7 @@ def _binary_cameras(data: _Bytes) -> _Lenses:
             raise ValueError(f"COLMAP has no lens {kind}")
         model = names[kind]
         params = numbers(list(data.take(f"{_COUNTS[model]}d")))
-        found[key] = _lens(model, picture_size(width, height), params)
+        found[key] = lens_of(model, picture_size(width, height), params)
     return found
 
 
@@ -336,7 +337,7 @@ def _binary_images(data: _Bytes) -> dict[int, _Image]:
     for _ in range(data.take("Q")[0]):
         key, *pose = data.take("I7d")
         (camera,) = data.take("I")
-        found[key] = _Image(_pose(numbers(pose)), camera, data.word())
+        found[key] = _Image(pose_of(numbers(pose)), camera, data.word())
         data.skip(24 * data.take("Q")[0])
     return found
 
@@ -349,7 +350,7 @@ def _binary_rigs(data: _Bytes) -> _Rigs:
         for index in range(count):
             kind, sensor = data.take("iI")
             posed = index > 0 and data.take("B")[0]
-            pose = _pose(numbers(list(data.take("7d")))) if posed else Pose.identity()
+            pose = pose_of(numbers(list(data.take("7d")))) if posed else Pose.identity()
             if kind == 0:  # a camera
                 rig[sensor] = pose
         found.append(rig)

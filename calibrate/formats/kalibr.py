@@ -1,4 +1,4 @@
-"""Kalibr's ``camchain.yaml``: each camera from the one before it."""
+"""Kalibr's ``camchain.yaml``, camera from camera; in, EuRoC's ``sensor.yaml``."""
 
 from __future__ import annotations
 
@@ -32,11 +32,21 @@ from chromeball.scene.pose import Pose
 TITLE = "Kalibr's camchain.yaml"
 #: Models that the format holds as they are.
 MODELS = ("pinhole", "LENSMODEL_OPENCV4", "kb4")
+#: Its camera models, and how many parameters stand before the focal lengths.
+_OWN = {"pinhole": 0, "omni": 1, "eucm": 2, "ds": 2}
 
 
 def holds(tree: dict[str, Any]) -> bool:
-    """Whether a tree is Kalibr's."""
-    return isinstance(tree.get("cam0"), dict) and "camera_model" in tree["cam0"]
+    """Whether a tree is Kalibr's: a chain, or a single camera without a name."""
+    return (
+        isinstance(tree.get("cam0"), dict) and "camera_model" in tree["cam0"]
+    ) or _is_single(tree)
+
+
+def _is_single(tree: dict[str, Any]) -> bool:
+    """Whether the root is one camera, as in the data sets that came with Kalibr (EuRoC)."""
+    flat = isinstance(tree.get("intrinsics"), list) and len(tree["intrinsics"]) > 3
+    return flat and "resolution" in tree and tree.get("camera_model") in _OWN
 
 
 def read(path: Path, hints: Hints) -> list[NamedCamera]:
@@ -54,6 +64,8 @@ def read(path: Path, hints: Hints) -> list[NamedCamera]:
 def cameras_of(tree: dict[str, Any], path: Path) -> list[NamedCamera]:
     """As :func:`read`, of a tree that was read."""
     found: list[NamedCamera] = []
+    if _is_single(tree):
+        tree = {"cam0": tree}
     names = sorted(
         (k for k in tree if re.fullmatch(r"cam\d{1,4}", k)), key=lambda k: int(k[3:])
     )
@@ -85,27 +97,34 @@ def _pose(entry: dict[str, Any], before: Pose | None) -> tuple[Pose, tuple[str, 
         return before @ link.inverse(), ()
     if "T_cam_imu" in entry:
         return rigid(numbers(entry["T_cam_imu"], 16).reshape(4, 4)).inverse(), ()
+    if "T_BS" in entry:  # EuRoC's body_from_sensor
+        matrix = entry["T_BS"]
+        values = numbers(matrix["data"] if isinstance(matrix, dict) else matrix, 16)
+        return rigid(values.reshape(4, 4)), ()
     if before is not None:
-        return Pose.identity(), ("no T_cn_cnm1: it stands at the origin",)
+        return Pose.identity(), (
+            "no T_cn_cnm1: where it stands is not known, and it is put at the origin",
+        )
     return Pose.identity(), ()
 
 
 def _lens(entry: dict[str, Any], pose: Pose) -> tuple[CameraModel, Loss | None]:
     size = picture_size(*numbers(entry["resolution"], 2).tolist())
     kind, distortion = str(entry["camera_model"]), str(entry.get("distortion_model", "none"))
-    own = {"pinhole": 0, "omni": 1, "eucm": 2, "ds": 2}.get(kind)
+    own = _OWN.get(kind)
     if own is None:
         raise ValueError(f"camera_model {kind[:40]!r} is none of pinhole, omni, eucm, ds")
     values = numbers(entry["intrinsics"], 4 + own)
     parameters, core = values[:own], values[own:]
     if core[:2].min() <= 0:
         raise ValueError("a focal length is not positive")
+    distortion = {"radial-tangential": "radtan"}.get(distortion, distortion)
     count = {"radtan": 4, "equidistant": 4, "fov": 1, "none": 0}.get(distortion)
     if count is None:
         raise ValueError(
             f"distortion_model {distortion[:40]!r} is none of radtan, equidistant, fov, none"
         )
-    terms = numbers(entry.get("distortion_coeffs", []))
+    terms = numbers(entry.get("distortion_coeffs", entry.get("distortion_coefficients", [])))
     if distortion != "none" and len(terms) != count:
         raise ValueError(f"{distortion} has {count} distortion_coeffs, not {len(terms)}")
     terms = terms[:count]

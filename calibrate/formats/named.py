@@ -46,8 +46,8 @@ class NamedCamera:
     rig. ``time_shift`` seconds are added to the camera's times to get the rig's, None where the
     file says nothing. ``loss``: the lens was changed to a model of ours. ``source``: the
     ``.cameramodel`` with more in it than the camera, kept when it is written unchanged but for
-    its pose. ``rig``: it stands fixed to the others of its file. ``notes``: what the file said
-    that a camera of ours does not hold, one line each.
+    its pose. ``rig``: it stands fixed to the others of its file. ``notes``: what the file left
+    open, or said that a camera of ours does not hold, one line each.
     """
 
     name: str

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -89,12 +90,26 @@ def cameras_of(tree: dict[str, Any], path: Path, hints: Hints) -> list[NamedCame
             terms = _vector(found["terms", side]) if ("terms", side) in found else np.zeros(0)
             camera, cost = _lens(core, terms, _is_fisheye(flat, hints), size)
             cameras.append(NamedCamera(name, camera.posed(pose), loss=cost, rig=len(sides) > 1))
+        if len(sides) > 1 and not holds_pose(tree):
+            cameras = [replace(camera, rig=False) for camera in cameras]
+            cameras[1] = replace(cameras[1], notes=(_unposed(path),))
     except UserError as error:
         raise UserError(error.what, file=path) from error
     except (ValueError, KeyError, OverflowError) as error:
         missing = f"{error} is missing" if isinstance(error, KeyError) else str(error)
         raise UserError(f"not a camera of OpenCV's: {missing}", file=path) from error
     return cameras
+
+
+def _unposed(path: Path) -> str:
+    """What a pair without R and T needs."""
+    beside = path.with_name(path.name.replace("intrinsics", "extrinsics"))
+    lies = beside != path and beside.is_file()
+    where = f"{beside.name}, which lies beside it," if lies else "the file that has them"
+    return (
+        "no R and T in the file: where it stands is not known, and both cameras are put at the "
+        f"origin; name {where} after {path.name}"
+    )
 
 
 def _plain(name: object) -> str:
@@ -176,11 +191,12 @@ def _is_fisheye(flat: dict[str, Any], hints: Hints) -> bool | None:
         kind = _plain(flat.get(key, ""))
         if any(word in kind for word in ("fisheye", "equidistant", "kannala", "kb4")):
             return True
-        if any(word in kind for word in ("plumb", "opencv", "radtan", "rational", "brown")):
+        if any(word in kind for word in _RADIAL):
             return False
     return hints.fisheye
 
 
+_RADIAL = ("plumb", "opencv", "radtan", "radialtan", "rational", "brown")
 _TRUTH = {"1": True, "true": True, "yes": True, "0": False, "false": False, "no": False}
 
 

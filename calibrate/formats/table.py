@@ -6,7 +6,7 @@ import importlib
 import os
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -85,64 +85,114 @@ def read_cameras(
 
     """
     known = hints or Hints()
-    files: list[tuple[Path, str, dict[str, Any]]] = []
+    files: list[_Source] = []
     for path in map(Path, paths):
-        name, tree = _recognised(path)
-        if name != "extrinsics":
-            files.append((path, name, tree))
-        elif files and files[-1][1] == "opencv":
-            there, _, before = files.pop()
-            files.append((there, "opencv", {**tree, **before}))
-        else:
-            raise UserError(
-                "it has R and T, but no camera matrix: name the file with that before it",
-                file=path,
-            )
+        for source in _opened(path):
+            if source.kind != "extrinsics":
+                files.append(source)
+            elif files and files[-1].kind == "opencv":
+                before = files.pop()
+                files.append(replace(before, tree={**source.tree, **before.tree}))
+            else:
+                raise UserError(
+                    "it has R and T, but no camera matrix: name the file with that before it",
+                    file=source.path,
+                )
     found: list[tuple[Path, list[NamedCamera]]] = []
-    for path, name, tree in files:
-        module = _module(name)
-        match name:
+    for source in files:
+        module, path = _module(source.kind), source.path
+        match source.kind:
             case "opencv":
-                found.append((path, module.cameras_of(tree, path, known)))
+                found.append((path, module.cameras_of(source.tree, path, known)))
             case "kalibr":
-                found.append((path, module.cameras_of(tree, path)))
+                found.append((path, module.cameras_of(source.tree, path)))
             case _:
                 found.append((path, module.read(path, known)))
     return _renamed(found)
 
 
-def _recognised(path: Path) -> tuple[str, dict[str, Any]]:
-    """The reader's module of a file or folder, and its tree where it has been read for that."""
+@dataclass(frozen=True)
+class _Source:
+    """A file or folder, its reader's module, and its ``tree`` where that has been read."""
+
+    path: Path
+    kind: str
+    tree: dict[str, Any] = field(default_factory=dict)
+
+
+def _opened(path: Path) -> list[_Source]:
+    """What `path` stands for: itself, or the camera files of a folder, R and T of a pair last.
+
+    In a folder files without a camera are passed over: records lie there, and reports.
+    """
+    own = path.is_dir() and (
+        any(path.glob("*.cameramodel"))
+        or (path / "rig.json").is_file()
+        or _module("colmap").is_model(path)
+    )
+    if own or not path.is_dir():
+        source = _recognised(path)
+        if source is None:
+            raise UserError("it has no camera of OpenCV's, ROS's or Kalibr's", file=path)
+        return [source]
+    found = [
+        source
+        for file in sorted(path.iterdir())
+        if file.suffix.lower() in (*_TREES, *_USD)
+        and file.is_file()
+        and not file.name.endswith(".record.json")
+        and (source := _recognised(file)) is not None
+    ]
+    cameras = [source for source in found if source.kind != "extrinsics"]
+    if not cameras:
+        ends = ", ".join((".cameramodel", *_TREES, *_USD))
+        raise UserError(f"no camera in this folder: neither COLMAP's nor {ends}", file=path)
+    poses = [source for source in found if source.kind == "extrinsics"]
+    if poses and len(found) > 2:
+        raise UserError(
+            f"it holds {len(cameras)} files of cameras and R and T apart from them, in "
+            f"{poses[0].path.name}: name the files one by one, R and T after their pair",
+            file=path,
+        )
+    return cameras + poses
+
+
+def _recognised(path: Path) -> _Source | None:
+    """By its name, or by what stands in it; None where no camera does."""
     if not path.exists():
         raise UserError("no such file", file=path)
     suffix = path.suffix.lower()
     if path.name == "rig.json":
-        return "cameramodel", {}
+        return _Source(path, "cameramodel")
     if _module("colmap").is_model(path):
-        return "colmap", {}
+        return _Source(path, "colmap")
     if path.is_dir() or suffix == ".cameramodel":
-        return "cameramodel", {}
+        return _Source(path, "cameramodel")
     if suffix in _USD:
-        return "usd", {}
+        return _Source(path, "usd")
     if suffix == ".py":
-        return "blender", {}
+        return _Source(path, "blender")
     if suffix not in _TREES:
         raise UserError(
             "no camera file: .cameramodel, .yml, .yaml, .json, .xml, .usd, .py (Blender's, "
-            "written here) and folders of COLMAP's or of .cameramodel files are read",
+            "written here) and folders of COLMAP's or of camera files are read",
             file=path,
         )
-    from chromeball.calibrate.formats.tree import read_tree
+    from chromeball.calibrate.formats.tree import read_root
 
-    tree = read_tree(path)
+    tree = read_root(path)
+    if isinstance(tree, list) and _module("colmap_rig").holds(tree):
+        return _Source(path, "colmap_rig")
+    if not isinstance(tree, dict):
+        return None
     if _module("kalibr").holds(tree):
-        return "kalibr", tree
+        return _Source(path, "kalibr", tree)
     opencv = _module("opencv")
     if opencv.holds(tree):
-        return "opencv", tree
+        return _Source(path, "opencv", tree)
     if opencv.holds_pose(tree):
-        return "extrinsics", tree
-    raise UserError("it has no camera of OpenCV's, ROS's or Kalibr's", file=path)
+        return _Source(path, "extrinsics", tree)
+    return None
 
 
 def _renamed(found: Sequence[tuple[Path, list[NamedCamera]]]) -> list[NamedCamera]:
@@ -165,16 +215,17 @@ class Prepared:
     """Cameras as a format holds them.
 
     ``losses``: what changes of lens models cost, reading included, by camera. ``left_behind``:
-    what else the format does not hold, a line each.
+    what else the format does not hold, ``notes``: what the files read left open, a line each.
     """
 
     cameras: list[NamedCamera]
     losses: list[tuple[str, Loss]]
     left_behind: list[str]
+    notes: list[str]
 
 
-def format_for(path: str | os.PathLike[str], to: str | None = None) -> str:
-    """The format of an output: `to`, or what its name says.
+def format_for(path: str | os.PathLike[str], to: str | None = None, cameras: int = 1) -> str:
+    """The format of an output: `to`, or what its name and the number of `cameras` say.
 
     Raises
     ------
@@ -189,6 +240,9 @@ def format_for(path: str | os.PathLike[str], to: str | None = None) -> str:
             return "cameramodel"
         if not fits:
             raise UserError(f"no format is written as {suffix}", file=path)
+        # Kalibr's own name for it; and OpenCV's file holds two cameras at most.
+        if "kalibr" in fits and ("camchain" in Path(path).stem or cameras > 2):
+            return "kalibr"
         if len(fits) > 1 and suffix != ".yml":
             raise UserError(f"say which: --to {' or --to '.join(fits)}", file=path)
         return fits[0]
@@ -239,8 +293,8 @@ def prepared(cameras: Sequence[NamedCamera], to: str, model: str | None = None) 
         except UserError as error:
             raise UserError(f"{named.name}: {error.what}", file=error.file) from error
         found.append(replace(named, camera=camera))
-    behind = [f"{named.name}: {note}" for named in cameras for note in named.notes]
-    behind += module.left_behind(found)
+    notes = [f"{named.name}: {note}" for named in cameras for note in named.notes]
+    behind: list[str] = module.left_behind(found)
     if any(
         there.camera.covariance is not None and here.camera.covariance is None
         for there, here in zip(cameras, found, strict=True)
@@ -248,7 +302,7 @@ def prepared(cameras: Sequence[NamedCamera], to: str, model: str | None = None) 
         behind.append("the lens's uncertainty: only its .cameramodel holds it")
     if to != "kalibr" and any(named.time_shift for named in cameras):
         behind.append("offsets in time: only Kalibr's chain holds them here")
-    return Prepared(found, losses, behind)
+    return Prepared(found, losses, behind, notes)
 
 
 def encoded(
@@ -290,7 +344,7 @@ def write_cameras(
         As :func:`format_for`, :func:`prepared` and :func:`encoded` do.
 
     """
-    kind = format_for(path, to)
+    kind = format_for(path, to, len(cameras))
     found = prepared(cameras, kind, model)
     for name, data in encoded(found.cameras, path, kind).items():
         write_bytes(Path(path) / name if name else path, data)

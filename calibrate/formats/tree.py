@@ -30,10 +30,7 @@ def read_text(path: Path) -> str:
 
 
 def read_tree(path: Path) -> dict[str, Any]:
-    """The mapping at the root of a YAML, JSON or XML file, by its first character.
-
-    Scalars of YAML and XML stay strings, tags are passed over, matrices of OpenCV are mappings
-    with ``rows``, ``cols`` and ``data``.
+    """As :func:`read_root`, where the root is a mapping.
 
     Raises
     ------
@@ -41,18 +38,33 @@ def read_tree(path: Path) -> dict[str, Any]:
         The file is missing, broken, or holds something else.
 
     """
+    tree = read_root(path)
+    if not isinstance(tree, dict):
+        raise UserError("not a camera file: it holds no names", file=path)
+    return tree
+
+
+def read_root(path: Path) -> Any:
+    """What stands at the root of a YAML, JSON or XML file, by its first character.
+
+    Scalars of YAML and XML stay strings, tags are passed over, matrices of OpenCV are mappings
+    with ``rows``, ``cols`` and ``data``.
+
+    Raises
+    ------
+    UserError
+        The file is missing or broken.
+
+    """
     text = read_text(path)
     start = text.lstrip()[:1]
     try:
-        tree = {"{": _json, "<": _xml}.get(start, _yaml)(text)
+        return {"{": _json, "[": _json, "<": _xml}.get(start, _yaml)(text)
     except RecursionError as error:
         raise UserError("nested too deep for a camera file", file=path) from error
     except ValueError as error:
         reason = " ".join(str(error).split())[:200]
         raise UserError(f"not a readable camera file ({reason})", file=path) from error
-    if not isinstance(tree, dict):
-        raise UserError("not a camera file: it holds no names", file=path)
-    return tree
 
 
 def _json(text: str) -> Any:

@@ -192,7 +192,7 @@ def test_a_rig_folder_keeps_order_and_times(tmp_path: Path) -> None:
     assert len(cost.left_behind) == 1  # the place of the first
     rig.write_text(json.dumps({"unit": "feet", "cameras": {"b": {}, "a": {}}}))
     cost = write_cameras(tmp_path / "c.usda", read_cameras([tmp_path]))
-    assert "b: places are in feet, not in metres" in cost.left_behind
+    assert "b: places are in feet, not in metres" in cost.notes
     rig.write_text(json.dumps({"cameras": {"c": {}}}))
     with pytest.raises(UserError, match="there is no c"):
         read_cameras([tmp_path])
@@ -260,7 +260,9 @@ def test_real_cameras_of_a_room() -> None:
         assert forward @ (middle - place) > 0.5 * np.linalg.norm(middle - place)
 
 
-def test_extrinsics_in_a_second_file(tmp_path: Path) -> None:
+def test_extrinsics_in_a_second_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """OpenCV's stereo sample writes two files, by `cv2.FileStorage`."""
     import cv2
 
@@ -285,6 +287,107 @@ def test_extrinsics_in_a_second_file(tmp_path: Path) -> None:
     assert right.camera.world_from_camera.matrix() == pytest.approx(POSE.matrix())
     with pytest.raises(UserError, match="file with that before it"):
         read_cameras(files[1:])
+    # the folder of both is the pair; without the second file nobody knows where one stands
+    assert [c.camera.world_from_camera.matrix().tolist() for c in (left, right)] == [
+        c.camera.world_from_camera.matrix().tolist()
+        for c in read_cameras([tmp_path], Hints(size=(640, 480)))
+    ]
+    alone = read_cameras(files[:1], Hints(size=(640, 480)))
+    assert not any(c.rig for c in alone)
+    assert "not known" in alone[1].notes[0]
+    assert "extrinsics.yml, which lies" in alone[1].notes[0]
+    files[1].unlink()
+    run("calibrate", "convert", files[0], "--size", "640x480", "-o", tmp_path / "rig")
+    warned = capsys.readouterr().err
+    assert "warning: right: no R and T" in warned
+    assert "name the file that has them" in warned
+
+
+def test_what_export_writes_is_read_back(tmp_path: Path) -> None:
+    """A folder of OpenCV's files with their records, as the command leaves it."""
+    rig = [NamedCamera("a", LENS), NamedCamera("b", FISHEYE.posed(Pose.identity()))]
+    write_cameras(tmp_path / "rig", rig)
+    run("export", "opencv", tmp_path / "rig", "-o", tmp_path / "storage")
+    (tmp_path / "storage/notes.json").write_text('{"made": "on set"}')
+    run("calibrate", "convert", tmp_path / "storage", "-o", tmp_path / "back")
+    for there, here in zip(rig, read_cameras([tmp_path / "back"]), strict=True):
+        assert here.name == there.name
+        np.testing.assert_allclose(here.camera.intrinsics, there.camera.intrinsics)
+        np.testing.assert_allclose(
+            here.camera.world_from_camera.matrix(),
+            there.camera.world_from_camera.matrix(),
+            atol=1e-12,
+        )
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(UserError, match="no camera in this folder"):
+        read_cameras([tmp_path / "empty"])
+    pose = {"R": np.eye(3).tolist(), "T": [0, 0, 1]}
+    (tmp_path / "storage/pose.json").write_text(json.dumps(pose))
+    with pytest.raises(UserError, match=r"2 files of cameras and R and T apart .* pose\.json"):
+        read_cameras([tmp_path / "storage"])
+
+
+def test_single_cameras_of_kalibr_and_its_data(tmp_path: Path) -> None:
+    """EuRoC's sensor.yaml: one camera at the root, radial-tangential."""
+    file = tmp_path / "sensor.yaml"
+    there = POSE.matrix()
+    file.write_text(
+        "%YAML:1.0\nsensor_type: camera\nrate_hz: 20\nresolution: [752, 480]\n"
+        f"T_BS:\n  cols: 4\n  rows: 4\n  data: {there.ravel().tolist()}\n"
+        "camera_model: pinhole\nintrinsics: [458.654, 457.296, 367.215, 248.375]\n"
+        "distortion_model: radial-tangential\n"
+        "distortion_coefficients: [-0.28, 0.07, 0.0002, 1.8e-05]\n"
+    )
+    (found,) = read_cameras([file])
+    assert found.camera.model == "LENSMODEL_OPENCV4"
+    np.testing.assert_allclose(found.camera.world_from_camera.matrix(), there, atol=1e-12)
+    rig = [NamedCamera(n, LENS) for n in "abc"]
+    assert write_cameras(tmp_path / "camchain.yaml", rig[:1]).losses[0][1].was == LENS.model
+    write_cameras(tmp_path / "three.yaml", rig)  # more than a file of OpenCV's holds
+    assert [c.name for c in read_cameras([tmp_path / "three.yaml"])] == ["cam0", "cam1", "cam2"]
+
+
+def test_configurations_of_rigs(tmp_path: Path) -> None:
+    """rig_config.json as COLMAP takes it: there and back, and what it leaves open."""
+    lens = CameraModel("LENSMODEL_OPENCV4", LENS.intrinsics[:8], LENS.size)
+    rig = [
+        NamedCamera("left", lens, rig=True),
+        NamedCamera("right", lens.posed(POSE), rig=True),
+    ]
+    write_cameras(tmp_path / "model", rig, "colmap")
+    beside = tmp_path / "model" / "rig_config.json"
+    alone = tmp_path / "rig_config.json"
+    alone.write_text(beside.read_text())
+    for file, hints in ((beside, Hints()), (alone, Hints(size=LENS.size))):
+        for there, here in zip(rig, read_cameras([file], hints), strict=True):
+            assert (here.name, here.rig, here.camera.size) == (there.name, True, LENS.size)
+            np.testing.assert_allclose(here.camera.intrinsics, lens.intrinsics)
+            np.testing.assert_allclose(
+                here.camera.world_from_camera.matrix(),
+                there.camera.world_from_camera.matrix(),
+                atol=1e-12,
+            )
+    assert [c.name for c in read_cameras([tmp_path / "model" / "rigs.txt"])] == [
+        "camera1",
+        "camera2",
+    ]
+    with pytest.raises(
+        UserError, match="left: it does not tell the picture's size: add --size"
+    ):
+        read_cameras([alone])
+    config = json.loads(beside.read_text())
+    del config[0]["cameras"][1]["cam_from_rig_rotation"]
+    alone.write_text(json.dumps(config))
+    assert "not known" in read_cameras([alone], Hints(size=LENS.size))[1].notes[0]
+    for change, said in (
+        (config * 2, "several rigs"),
+        ([{"cameras": [{"image_prefix": "left/"}]}], "left: it says where .* but has no lens"),
+        ([{"cameras": 3}], "no readable rig"),
+        ([{"cameras": [{"ref_sensor": True}]}], "camera1: 'image_prefix' is missing"),
+    ):
+        alone.write_text(json.dumps(change))
+        with pytest.raises(UserError, match=said):
+            read_cameras([alone])
 
 
 def test_ros_and_words_of_others(tmp_path: Path) -> None:

@@ -42,9 +42,9 @@ def convert(
     Parameters
     ----------
     sources
-        Files or folders: .cameramodel, OpenCV's .yml, .json and .xml (one camera, or a pair
-        with R and T, which may stand in a second file), ROS camera_info, COLMAP's model,
-        Kalibr's camchain.yaml, OpenUSD, a script for Blender written here, a rig's folder.
+        Files or folders of them: .cameramodel, OpenCV's .yml, .json and .xml (one camera, or a
+        pair with R and T, which may stand in a second file), ROS camera_info, COLMAP's model or
+        rig_config.json, Kalibr's camchain.yaml, OpenUSD, a script for Blender written here.
     output
         What to write: a file, or a folder for many cameras.
     to
@@ -92,7 +92,7 @@ def write_as(
     """Write `cameras` within `stage`, and say what it cost."""
     from chromeball.calibrate.formats import encoded, format_for, prepared
 
-    kind = format_for(output, to)
+    kind = format_for(output, to, len(cameras))
     with stage:
         found = prepared(cameras, kind, model)
         losses = [{"camera": name, **asdict(loss)} for name, loss in found.losses]
@@ -101,6 +101,7 @@ def write_as(
             "cameras": [_told(named) for named in found.cameras],
             "conversions": losses,
             "left_behind": found.left_behind,
+            "notes": found.notes,
         }
         for name, data in encoded(found.cameras, output, kind).items():
             with stage.output(output / name if name else output) as temporary:
@@ -114,6 +115,8 @@ def write_as(
         out += turn if loss.turned else ""
         warning = "warning: " if loss.worst > _FAR or loss.left_out > 0 else ""
         say(f"{warning}{off}{out}; at most {loss.worst:.2g})")
+    for line in found.notes:
+        say(f"warning: {line}")
     for line in found.left_behind:
         say(f"left behind: {line}")
     if json:
