@@ -4,12 +4,12 @@ Three ways lead to a focal length in pixels: the focal length over the sensor's 
 pixels a millimetre that some cameras write; and the equivalent for 36 x 24 mm. Each has an
 error from the rounding of its numbers and one of its kind, which are assumptions:
 
-- A lens's marked focal length, or a zoom's reported one, holds to 2 %.
+- A lens's marked focal length, or a zoom's reported one, holds to 2 %, typed or not.
 - The lens is focused somewhere between a metre and infinity, which changes the image's size by
   up to f / (1 m - f); lenses that focus inside breathe by as much to either side.
-- A sensor's nominal width is that of its active pixels to 1 %. Compact cameras straighten their
-  pictures and crop them, for which 5 % is allowed below four-thirds: a Panasonic TZ41's 4.3 mm
-  on 1/2.3 inch come out 9 % short of what a panorama tells.
+- A sensor's nominal width is that of its active pixels to 1 %, typed or not. Compact cameras
+  straighten their pictures and crop them, for which 5 % is allowed below four-thirds: a
+  Panasonic TZ41's 4.3 mm on 1/2.3 inch come out 9 % short of what a panorama tells.
 - FocalPlaneXResolution to 3 %: a Canon 5D Mark II and a 550D write widths of 37.06 and 22.99 mm
   for sensors of 36.0 and 22.3.
 - Equivalents hold to 3 %: the same camera's 25 mm is 5 % short, a Kodak Z612's 35 mm 1 %.
@@ -70,6 +70,8 @@ MARKED, ACTIVE, RESOLUTION, EQUIVALENT = 0.02, 0.01, 0.03, 0.03
 #: Sensors narrower than this (mm) are compact cameras', whose pictures are straightened.
 COMPACT, STRAIGHTENED = 17.0, 0.05
 NEAREST = 1000.0
+#: Canon's 5200 mm f/14, the longest lens that was sold for cameras.
+LONGEST = 5200.0
 #: A principal point lies this share of the width from the middle (1 sigma).
 CENTRE = 0.01
 #: Aspects that differ by more mean that the picture was cropped.
@@ -147,9 +149,18 @@ def from_attributes(
         raise UserError(
             f"its lens is a fisheye ({lens}): metadata do not tell the projection; calibrate it"
         )
-    marked = focal if focal is not None else positive(known.get("FocalLength"))
-    if focal is not None and not 0 < focal < 1e5:
-        raise UserError(f"a focal length of {focal:g} mm is none")
+    written = positive(known.get("FocalLength"))
+    marked = written if focal is None else focal
+    if marked is not None and not 0 < marked <= LONGEST:
+        said = "its metadata tell" if focal is None else "--focal says"
+        raise UserError(
+            f"{said} {marked:g} mm: no lens has that, the longest is one of {LONGEST:g} mm; "
+            "give the focal length engraved on the lens with --focal"
+        )
+    if focal is not None and written is not None and (
+        abs(math.log(focal / written)) > 2 * math.hypot(MARKED, _marked_error(written))
+    ):  # fmt: skip
+        notes.append(f"its metadata tell {written:g} mm: --focal {focal:g} goes before them")
     equivalent = None if focal is not None else positive(known.get("FocalLengthIn35mmFilm"))
     zoom = positive(known.get("DigitalZoomRatio"))
     zoomed = zoom is not None and zoom > 1.001
@@ -160,7 +171,7 @@ def from_attributes(
     clues: list[Clue] = []
     long_side = max(size)
     if marked is not None:
-        own = _marked_error(marked) if focal is None else 0.0
+        own = _marked_error(marked)
         scale = (zoom or 1.0) if zoomed else 1.0
         if body is not None:
             error = math.hypot(own, nominal, cropped)
@@ -226,7 +237,7 @@ def _sensor(sensor: str | None, model: str) -> tuple[tuple[float, float] | None,
             ) from error
         if not 0.5 <= width <= 200:
             raise UserError(f"--sensor {sensor}: no sensor is {width:g} mm wide")
-        return (width, math.nan), 0.0
+        return (width, math.nan), _active(width)
     for pattern, name in MODELS:
         if re.fullmatch(pattern, model.strip(), re.IGNORECASE):
             return FORMATS[name], _active(FORMATS[name][0])

@@ -88,11 +88,20 @@ def read_tracker(path: str | os.PathLike[str]) -> TrackerFile:
     Raises
     ------
     UserError
-        No such file, not JSON, an unknown or missing key, a covariance of another size.
+        No such file, another kind of file, not JSON, an unknown or missing key, a covariance of
+        another size.
 
     """
+    file = Path(path)
+    if file.suffix != ".json" or file.name.endswith(".record.json"):
+        kind = "a record" if file.suffix == ".json" else "another kind of file"
+        raise UserError(
+            f"{kind}: what is needed is the tracker.json that `calibrate tracker` wrote, which "
+            "holds where the camera sits on the sensor",
+            file=path,
+        )
     try:
-        content = decode(Path(path).read_bytes(), TrackerFile, path)
+        content = decode(file.read_bytes(), TrackerFile, path)
     except FileNotFoundError as error:
         raise UserError("no such file; `calibrate tracker` makes one", file=path) from error
     except OSError as error:

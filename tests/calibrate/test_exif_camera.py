@@ -31,6 +31,18 @@ def test_known_body() -> None:
     assert found.notes == ()
 
 
+def test_typed_numbers_are_no_better_than_marked_ones() -> None:
+    """A focal length is engraved to 2 %, whoever reads it; a sensor's width is nominal."""
+    read = from_attributes(BODY, (5616, 3744))
+    for words in ({"focal": 50.0}, {"focal": 50.0, "sensor": "36"}):
+        typed = from_attributes({"Model": BODY["Model"]}, (5616, 3744), **words)
+        assert typed.camera.intrinsics[0] == pytest.approx(read.camera.intrinsics[0])
+        assert typed.focal_error == pytest.approx(read.focal_error)
+    other = from_attributes(BODY, (5616, 3744), focal=35.0)
+    assert other.notes == ("its metadata tell 50 mm: --focal 35 goes before them",)
+    assert from_attributes(BODY, (5616, 3744), focal=50.4).notes == ()
+
+
 def test_smaller_and_turned_pictures_see_the_same() -> None:
     whole = from_attributes(BODY, (5616, 3744))
     small = from_attributes(BODY, (1404, 936))
@@ -79,7 +91,9 @@ def test_focal_plane_resolution_and_zoom() -> None:
         ({"Model": "Nameless"}, {}, "not the sensor: give --sensor, one of medium"),
         ({}, {"sensor": "huge"}, "a width in mm, or one of"),
         ({}, {"sensor": "900"}, "no sensor is 900 mm wide"),
-        ({}, {"focal": -1.0}, "is none"),
+        ({}, {"focal": -1.0}, "--focal says -1 mm: no lens has that"),
+        ({}, {"focal": 50000.0}, "no lens has that, the longest is one of 5200 mm"),
+        ({"Exif:FocalLength": 50000.0}, {}, "its metadata tell 50000 mm: no lens has that"),
     ],
 )
 def test_refusals(change: dict[str, Any], words: dict[str, Any], message: str) -> None:

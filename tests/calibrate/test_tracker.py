@@ -389,6 +389,15 @@ def test_any_text_is_a_log_or_refused(
 # ---- the commands
 
 
+@pytest.mark.parametrize("name", ["lens.cameramodel", "tracker.json.record.json"])
+def test_files_beside_the_trackers(tmp_path: Path, name: str) -> None:
+    CAMERA.write(tmp_path / name)
+    with pytest.raises(
+        UserError, match=r"needed is the tracker\.json that `calibrate tracker`"
+    ):
+        read_tracker(tmp_path / name)
+
+
 def _on_wall(camera_from_board: Pose) -> Pose:
     return Pose(np.diag([1.0, -1, -1]), np.zeros(3)) @ camera_from_board.inverse()
 

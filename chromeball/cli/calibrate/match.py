@@ -91,6 +91,12 @@ def match(
         raise UserError("--bend-sigma says nothing of a known lens: leave it out")
     if bend_sigma is not None and not 0 <= bend_sigma < 1:
         raise UserError(f"--bend-sigma {bend_sigma:g}: a share of the distance, such as 0.03")
+    if not any((points, lines, rectangle, align, corners)):
+        raise UserError(
+            "a picture alone tells no camera: give points of known place (--points FILE), "
+            "edges along the axes (--lines FILE, with two points), or a rectangle on the floor "
+            "(--rectangle 0.6x0.4 or --align FILE) and the pixels of its --corners"
+        )
     known = focal == "known" or (focal == "auto" and camera is not None)
     if known and centre_sigma is not None:
         raise UserError("--centre-sigma says nothing of a known lens: leave it out")
