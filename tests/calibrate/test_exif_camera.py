@@ -34,8 +34,8 @@ def test_known_body() -> None:
 def test_typed_numbers_are_no_better_than_marked_ones() -> None:
     """A focal length is engraved to 2 %, whoever reads it; a sensor's width is nominal."""
     read = from_attributes(BODY, (5616, 3744))
-    for words in ({"focal": 50.0}, {"focal": 50.0, "sensor": "36"}):
-        typed = from_attributes({"Model": BODY["Model"]}, (5616, 3744), **words)
+    for sensor in (None, "36"):
+        typed = from_attributes({"Model": BODY["Model"]}, (5616, 3744), sensor, 50.0)
         assert typed.camera.intrinsics[0] == pytest.approx(read.camera.intrinsics[0])
         assert typed.focal_error == pytest.approx(read.focal_error)
     other = from_attributes(BODY, (5616, 3744), focal=35.0)
