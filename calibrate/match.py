@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from chromeball.calibrate.match_check import refuse_mirrored, told_apart, wrong_points
 from chromeball.calibrate.match_start import candidates, starts
 from chromeball.calibrate.resection import (
     BENT,
@@ -28,6 +29,7 @@ from chromeball.calibrate.resection import (
     linearise,
     refine,
 )
+from chromeball.calibrate.wrong_click import SOUND, WrongClick, refuse_gross
 from chromeball.scene.camera import CameraModel
 from chromeball.scene.errors import UserError
 from chromeball.scene.pose import Pose
@@ -45,6 +47,8 @@ RIVAL = 9.0
 #: A lens that nobody knows moves the picture's corners by this share of their distance from the
 #: middle (1 sigma): photographic lenses by up to 0.03, webcams by more.
 BEND = 0.03
+#: What is believed of k1 follows the focal length, until that changes by less (ln f).
+ROUNDS, SETTLED = 10, 1e-4
 NAMES = ("focal", "cx", "cy", "pitch", "yaw", "roll", "x", "y", "z", "k1")
 
 
@@ -59,7 +63,8 @@ class Match:
     k1; zero for what was known. ``misfit`` is how many times as far the clicks are off as
     their sigma explains, 1 where nothing can tell; above 1 the covariance is larger by its
     square.
-    ``rivals`` are cameras elsewhere that fit as well within 3 standard deviations.
+    ``rivals`` are cameras elsewhere that fit as well within 3 standard deviations, beyond what
+    the standard errors tell. ``wrong`` are points that the others contradict.
     """
 
     camera: CameraModel
@@ -71,6 +76,7 @@ class Match:
     condition: float
     misfit: float
     rivals: tuple[CameraModel, ...]
+    wrong: tuple[WrongClick, ...] = ()
 
     @property
     def standard_errors(self) -> Array:
@@ -120,8 +126,8 @@ def match(
     Raises
     ------
     UserError
-        Too little evidence, or evidence that leaves focal length or pose open, or that no
-        camera can have seen.
+        Too little evidence, or evidence that leaves focal length or pose open, that no camera
+        can have seen, that is mirrored, or a point that the others contradict.
 
     """
     width = lens.size[0]
@@ -138,7 +144,13 @@ def match(
     free = POSE.copy() if focal_known else np.arange(UNKNOWNS) < 9
     free[9] = bends
     _check_count(evidence, focal_known)
-    fits = _solve(lens, evidence, free, focal_known, bend_sigma)
+
+    def solve(evidence: Evidence) -> list[Fit]:
+        return _solve(lens, evidence, free, focal_known, bend_sigma)
+
+    fits = solve(evidence)
+    if not fits:
+        refuse_mirrored(evidence, width, solve)
     standing = [fit for fit in fits if not above_floor or fit.pose.inverse().translation[1] > 0]
     if not standing:
         raise UserError(
@@ -148,6 +160,13 @@ def match(
             else "no camera sees these points and lines like this: check their order and place"
         )
     best = standing[0]
+    evidence = _bending(evidence, best.camera, free, bend_sigma)
+    spare = len(best.rows) - int(free.sum())
+    misfit = math.sqrt(best.cost / spare) if spare > 0 else 1.0
+    if misfit > SOUND:
+        refuse_mirrored(evidence, width, solve)
+    wrong = wrong_points(evidence, best, spare, free, solve)
+    refuse_gross(wrong, "point")
     count = len(evidence.points)
     residuals = best.rows[: 2 * count].reshape(-1, 2) * sigma
     along = best.rows[2 * count : 2 * count + len(evidence.axes)] * sigma * math.sqrt(2)
@@ -160,14 +179,19 @@ def match(
             "axis a line runs along, and whether the lens distorts (--camera)"
         )
     covariance, condition = _covariance(best, free, evidence)
-    spare = len(best.rows) - int(free.sum())
-    misfit = math.sqrt(best.cost / spare) if spare > 0 else 1.0
-    covariance = covariance * max(misfit, 1.0) ** 2
-    rivals = [
-        fit.camera.posed(fit.pose.inverse())
-        for fit in standing[1:]
-        if fit.cost - best.cost < RIVAL * max(misfit, 1.0) ** 2 and not _same(fit, best)
-    ]
+    inflated = max(misfit, 1.0) ** 2
+    covariance = covariance * inflated
+    if not (error := math.sqrt(covariance[0, 0])) < WORST_FOCAL:
+        raise UserError(
+            f"the clicks are {misfit:.0f} times as far off as their sigma says, which leaves "
+            f"the focal length open (standard error {error:.0%}): check the order of the "
+            "points, and look for wrong ones"
+        )
+    rivals: list[Fit] = []
+    for fit in standing[1:]:
+        close = fit.cost - best.cost < RIVAL * inflated
+        if close and all(told_apart(fit, f, free, RIVAL * inflated) for f in (best, *rivals)):
+            rivals.append(fit)
     return Match(
         camera=best.camera.posed(best.pose.inverse()),
         residuals=residuals,
@@ -177,7 +201,8 @@ def match(
         covariance=covariance,
         condition=condition,
         misfit=misfit,
-        rivals=tuple(rivals),
+        rivals=tuple(fit.camera.posed(fit.pose.inverse()) for fit in rivals),
+        wrong=wrong,
     )
 
 
@@ -263,14 +288,39 @@ def _solve(
     rough.sort(key=lambda fit: fit.cost)
     found: list[Fit] = []
     for start in rough:
-        corner = math.hypot(*lens.size) / 2 / start.camera.intrinsics[0]
-        evidence = replace(evidence, k1_sigma=bend_sigma / corner**2) if free[9] else evidence
-        fit = refine(start.camera, start.pose, evidence, free, steps=60)
+        least = min((fit.cost for fit in found), default=math.inf)
+        fit = _settled(start, evidence, free, bend_sigma, least + 10 * RIVAL * (1 + least))
         if fit is None or not _sound(fit, evidence) or any(_same(fit, f) for f in found):
             continue
         found.append(fit)
     found.sort(key=lambda fit: fit.cost)
     return found
+
+
+def _settled(
+    start: Fit, evidence: Evidence, free: NDArray[np.bool_], bend_sigma: float, worst: float
+) -> Fit | None:
+    """All `free` unknowns from `start` on; no further where the cost stays above `worst`."""
+    fit = start
+    for _ in range(ROUNDS):
+        believed = _bending(evidence, fit.camera, free, bend_sigma)
+        new = refine(fit.camera, fit.pose, believed, free, steps=60)
+        if new is None or new.cost > worst or abs(_focals_apart(new, fit)) < SETTLED:
+            return new
+        fit = new
+    return fit
+
+
+def _bending(
+    evidence: Evidence, camera: CameraModel, free: NDArray[np.bool_], bend_sigma: float
+) -> Evidence:
+    """With what is believed of k1, which moves the corners by less the longer the lens is."""
+    corner = math.hypot(*camera.size) / 2 / camera.intrinsics[0]
+    return replace(evidence, k1_sigma=bend_sigma / corner**2) if free[9] else evidence
+
+
+def _focals_apart(a: Fit, b: Fit) -> float:
+    return math.log(a.camera.intrinsics[0] / b.camera.intrinsics[0])
 
 
 def _sound(fit: Fit, evidence: Evidence) -> bool:
@@ -331,6 +381,5 @@ def _same(a: Fit, b: Fit) -> bool:
     turn = Pose(a.pose.rotation.T @ b.pose.rotation, np.zeros(3)).rotation_vector()
     here, there = a.pose.inverse().translation, b.pose.inverse().translation
     far = 1e-3 * max(float(np.linalg.norm(a.pose.translation)), 1e-9)
-    focal = abs(math.log(a.camera.intrinsics[0] / b.camera.intrinsics[0]))
     near = float(np.linalg.norm(here - there)) < far
-    return bool(np.linalg.norm(turn) < 1e-3 and near and focal < 1e-3)
+    return bool(np.linalg.norm(turn) < 1e-3 and near and abs(_focals_apart(a, b)) < 1e-3)

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from chromeball.calibrate.resection import POSE, TURN, Evidence, refine
+from chromeball.calibrate.wrong_click import ALARM, WrongClick, refuse_gross, wrong_clicks
 from chromeball.scene.camera import CameraModel
 from chromeball.scene.errors import UserError
 from chromeball.scene.pose import Pose
@@ -33,6 +34,9 @@ class Realignment:
     ``after`` (N,) are the pairs' distances in the picture, pixels; ``freedom`` is what was
     solved: 2, 3 or 6; ``covariance`` (6, 6) of the turn about the camera's axes (radians) and
     of its place (world, metres): zero for what was held, NaN where one pair says nothing.
+    ``misfit`` is how many times as far the pairs are off as their sigma explains, 1 where
+    nothing can tell; where that is beyond chance, the covariance is larger by its square.
+    ``wrong`` are pairs that the others contradict.
     """
 
     camera: CameraModel
@@ -41,6 +45,8 @@ class Realignment:
     after: Array
     freedom: int
     covariance: Array
+    misfit: float
+    wrong: tuple[WrongClick, ...]
 
     @property
     def turn(self) -> float:
@@ -65,9 +71,11 @@ def realign(
     ------
     UserError
         Points behind the camera or pixels beyond the lens, points in a line, a turn beyond 60
-        degrees.
+        degrees, pairs that do not fit together, a single one that the others contradict.
 
     """
+    from scipy import stats
+
     p, q = np.asarray(points, float), np.asarray(pixels, float)
     if p.ndim != 2 or p.shape[1] != 3 or q.shape != (len(p), 2) or not len(p):
         raise UserError("every point of the model needs its pixel, and one pair at least")
@@ -87,13 +95,26 @@ def realign(
     start = Pose(_turn(unit, rays), np.zeros(3)) @ old.inverse()
     freedom = 2 if len(p) == 1 else 3 if len(p) == 2 or keep_place else 6
     covariance = np.full((6, 6), np.nan)
-    now = start
+    now, misfit, wrong = start, 1.0, tuple[WrongClick, ...]()
     if freedom > 2:
         free = TURN if freedom == 3 else POSE
         _check_spread(unit, p, freedom)
-        fit = refine(camera, start, Evidence(p, q, sigma), free)
+        evidence = Evidence(p, q, sigma)
+        fit = refine(camera, start, evidence, free)
         if fit is None:
             raise UserError("no turn of the camera brings the points near their pixels")
+        spare = 2 * len(p) - freedom
+        misfit = math.sqrt(fit.cost / spare) if spare else 1.0
+        pose = fit.pose
+        wrong = wrong_clicks(evidence, fit, spare, lambda e: refine(camera, pose, e, free))
+        refuse_gross(wrong, "pair")
+        if freedom == 6 and misfit * sigma > max(10 * sigma, 0.01 * math.hypot(*camera.size)):
+            worst = int(np.argmax(np.linalg.norm(fit.rows.reshape(-1, 2), axis=1))) + 1
+            raise UserError(
+                f"the pairs do not fit together, they stay {misfit * sigma:.1f} px off a "
+                f"coordinate, pair {worst} most: check which point belongs to which pixel, the "
+                "model's unit, and the lens"
+            )
         normal = fit.jacobian.T @ fit.jacobian
         size = np.sqrt(np.diag(normal))
         if not np.linalg.cond(normal / np.outer(size, size)) < 1e12:
@@ -109,6 +130,8 @@ def realign(
             change[:3, :3] *= -1
             change[3:, 3:] = -now.rotation.T
             covariance = change @ spread @ change.T
+        if stats.chi2.sf(misfit**2 * spare, spare) < ALARM:  # never at no spare
+            covariance *= misfit**2
     placed = now.inverse()
     move = old @ now  # the model moved, seen by the camera as it stood
     result = Realignment(
@@ -118,6 +141,8 @@ def realign(
         after=np.linalg.norm(camera.project(now.apply(p)) - q, axis=1),
         freedom=freedom,
         covariance=covariance,
+        misfit=misfit,
+        wrong=wrong,
     )
     if result.turn > LARGEST:
         raise UserError(

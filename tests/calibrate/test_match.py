@@ -194,6 +194,51 @@ def test_views_that_leave_it_open() -> None:
     np.testing.assert_allclose(known.camera.world_from_camera.translation[1], 1, atol=1e-3)
 
 
+def test_a_wrong_point_is_named() -> None:
+    """39 px among eight points, of which the fit shows 12 and hides the rest in the others."""
+    truth, rng = camera(), np.random.default_rng(0)
+    q = truth.project_world(CLOUD) + rng.normal(0, 0.5, (8, 2))
+    assert match(BLANK, CLOUD, q).wrong == ()
+    for k in (1, 5):
+        wrong = q.copy()
+        wrong[k] += [30, -25]
+        with pytest.raises(UserError, match=rf"point {k + 1} lies \d\d\.\d px from where"):
+            match(BLANK, CLOUD, wrong)
+
+
+def test_mirrored_points_are_refused() -> None:
+    """They fit a camera of 12000 px, to 88 %, that stands on the other side."""
+    truth, rng = camera(), np.random.default_rng(0)
+    q = truth.project_world(CLOUD) + rng.normal(0, 0.5, (8, 2))
+    for points, pixels in (
+        (CLOUD * [-1, 1, 1], q),
+        (CLOUD, [0, SIZE[1] - 1] + q * [1, -1]),
+    ):
+        with pytest.raises(UserError, match="seen mirrored"):
+            match(BLANK, points, np.asarray(pixels))
+
+
+def test_clicks_that_leave_the_focal_length_open() -> None:
+    """Points in another order: the misfit is in the standard errors, and those are refused."""
+    q = camera().project_world(CLOUD)[[1, 0, 3, 2, 4, 5, 6, 7]]
+    with pytest.raises(UserError, match=r"check (their|the) order"):
+        match(BLANK, CLOUD, q)
+    # few rows over: small residuals, open all the same
+    near = CLOUD[:6] * [0.1, 0.1, 0.1]
+    noise = np.random.default_rng(0).normal(0, 6, (6, 2))
+    with pytest.raises(UserError, match="focal length open"):
+        match(BLANK, near, camera().project_world(near) + noise)
+
+
+def test_one_solution_is_told_once() -> None:
+    """Steps along a flat valley end here and there: no other camera."""
+    truth, rng = camera(), np.random.default_rng(1)
+    for _ in range(12):
+        points = rng.uniform(-0.2, 0.2, (5, 3))
+        q = truth.project_world(points) + rng.normal(0, 0.5, (5, 2))
+        assert match(BLANK, points, q).rivals == ()
+
+
 def test_refusals() -> None:
     truth = camera()
     q, line = truth.project_world(RECTANGLE), ends(truth)

@@ -85,6 +85,41 @@ def test_covariance_is_honest() -> None:
     assert np.mean(distances) == pytest.approx(6, abs=2)
 
 
+def test_a_wrong_pair_is_named() -> None:
+    """47 px off among eight pairs puts the camera off by 0.17 m if it counts."""
+    rng = np.random.default_rng(3)
+    points = rng.uniform(-0.4, 0.4, (12, 3))
+    clicks = TRUE.project_world(points) + rng.normal(0, 0.5, (12, 2))
+    sound = realign(MOVED, points, clicks)
+    assert sound.wrong == ()
+    assert sound.misfit < 1.5
+    far, near = clicks.copy(), clicks.copy()
+    far[3] += [40, -25]
+    with pytest.raises(UserError, match=r"pair 4 lies \d\d\.\d px from .* correct or remove"):
+        realign(MOVED, points[:8], far[:8])
+    near[5] += [0, 3.8]  # eight deviations
+    told = realign(MOVED, points, near)
+    assert [click.index for click in told.wrong] == [5]
+    assert told.misfit > 1.5
+    swapped = clicks[[1, 0, 3, 2, 5, 4, 7, 6, 9, 8, 10, 11]]
+    with pytest.raises(UserError, match=r"the pairs do not fit together, they stay \d+"):
+        realign(MOVED, points, swapped)
+
+
+def test_sloppy_clicks_are_not_accused() -> None:
+    """Said to be good to 0.5 px, they are to 2: standard errors follow, nobody is named."""
+    rng = np.random.default_rng(4)
+    accused, misfits = 0, list[float]()
+    for _ in range(20):
+        clicks = TRUE.project_world(POINTS) + rng.normal(0, 2, (6, 2))
+        found = realign(MOVED, POINTS, clicks)
+        accused += len(found.wrong)
+        misfits.append(found.misfit)
+    assert accused == 0
+    # chi-squared with 6 degrees of freedom: the mean of 20 squares to 13 %
+    assert np.mean(np.square(misfits)) == pytest.approx(16, rel=0.4)
+
+
 def test_refusals() -> None:
     q = TRUE.project_world(POINTS)
     line = np.linspace(0, 1, 4)[:, None] * [0.1, 0.2, 0.1]
@@ -106,6 +141,19 @@ def test_refusals() -> None:
     )
     with pytest.raises(UserError, match="turn the camera by 1"):
         realign(around, POINTS[:2], TRUE.project_world(POINTS[:2]))
+
+
+def test_pairs_that_do_not_fit_are_warned_of(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before, pairs = tmp_path / "a.cameramodel", tmp_path / "pairs.csv"
+    TURNED.write(before)
+    q = TRUE.project_world(POINTS[:2]) + [[0, 0], [9, 0]]
+    rows = np.concatenate([POINTS[:2], q], axis=1).tolist()
+    pairs.write_text("x,y,z,u,v\n" + "\n".join(",".join(map(str, r)) for r in rows))
+    words = ["calibrate", "realign", before, "--pairs", pairs, "-o", tmp_path / "b.cameramodel"]
+    build_app()([str(w) for w in words], result_action="return_value")
+    assert "times as far off as --sigma says" in capsys.readouterr().err
 
 
 def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

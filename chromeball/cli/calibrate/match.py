@@ -17,9 +17,6 @@ from chromeball.cli.calibrate.clicks import (
 from chromeball.scene.errors import UserError
 from chromeball.scene.record import Stage
 
-#: Clicks this many times farther off than they are said to be are worth a word.
-MISFIT = 2.0
-
 
 def match(
     picture: Path,
@@ -78,6 +75,7 @@ def match(
     from chromeball.calibrate.formats import read_camera
     from chromeball.calibrate.match import BEND, NAMES
     from chromeball.calibrate.match import match as solve
+    from chromeball.calibrate.wrong_click import SOUND
     from chromeball.scene.camera import CameraModel
     from chromeball.scene.image import read_header
 
@@ -156,6 +154,7 @@ def match(
                 "position": place,
                 "sigma_position": errors[6:9],
                 "misfit": found.misfit,
+                "wrong_points": [click.index + 1 for click in found.wrong],
                 "sigma_rotation_degrees": [math.degrees(v) for v in errors[3:6]],
                 "residuals": found.residuals,
                 "line_residuals": found.line_residuals,
@@ -173,7 +172,9 @@ def match(
         )
         with stage.output(output) as temporary:
             found.camera.write(temporary)
-    if found.misfit > MISFIT:
+    for click in found.wrong:
+        say(f"warning: {click.words('point')}: correct or remove it")
+    if found.misfit > SOUND and not found.wrong:
         say(
             f"the clicks are {found.misfit:.1f} times as far off as --sigma says, which is in "
             "the standard errors: look for a wrong point, or calibrate the lens"

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from chromeball.cli.calibrate.arguments import Json, Out, print_figures
+from chromeball.cli.calibrate.arguments import Json, Out, print_figures, say
 from chromeball.cli.calibrate.clicks import read_pairs
 from chromeball.scene.errors import UserError
 from chromeball.scene.record import Stage
@@ -37,7 +37,7 @@ def realign(
     output
         The .cameramodel to write, posed anew.
     sigma
-        Standard deviation of a click in pixels, for the standard errors.
+        Standard deviation of a click in pixels, for the standard errors and for wrong pairs.
     keep_place
         Turn only, however many pairs there are.
     json
@@ -46,6 +46,7 @@ def realign(
     """
     from chromeball.calibrate.formats import read_camera
     from chromeball.calibrate.realign import realign as solve
+    from chromeball.calibrate.wrong_click import SOUND
 
     if output.suffix != ".cameramodel":
         raise UserError("a camera model's name ends in .cameramodel", file=output)
@@ -67,6 +68,8 @@ def realign(
                 "freedom": found.freedom,
                 "before_px": found.before,
                 "after_px": found.after,
+                "misfit": found.misfit,
+                "wrong_pairs": [click.index + 1 for click in found.wrong],
                 "turn_degrees": math.degrees(found.turn),
                 "moved_metres": float(np.linalg.norm(moved)),
                 "sigma_rotation_degrees": np.degrees(errors[:3]),
@@ -76,6 +79,13 @@ def realign(
         )
         with stage.output(output) as temporary:
             found.camera.write(temporary)
+    for click in found.wrong:
+        say(f"warning: {click.words('pair')}: correct or remove it")
+    if found.misfit > SOUND and not found.wrong:
+        say(
+            f"warning: the pairs are {found.misfit:.1f} times as far off as --sigma says, pair "
+            f"{int(np.argmax(found.after)) + 1} most: look for a wrong one, or give more pairs"
+        )
     if json:
         print_figures(stage.figures)
         return
