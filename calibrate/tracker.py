@@ -21,10 +21,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from chromeball.calibrate.hand_eye import FAR, Frames, hand_eye, view_errors
+from chromeball.calibrate.hand_eye import FAR, Frames, hand_eye, refuse_single_axis, view_errors
 from chromeball.calibrate.tracker_adjust import Noise, Rows, State, adjust, covariance
 from chromeball.calibrate.tracker_checks import check_scale, refuse_open, refuse_unlike
-from chromeball.calibrate.tracker_log import TrackerLog, reached, sample, usual_window
+from chromeball.calibrate.tracker_delay import SEARCH, STEP, search_delay
+from chromeball.calibrate.tracker_log import TrackerLog, reached, usual_window
+from chromeball.calibrate.tracker_readings import alternatives
 from chromeball.scene.camera import CameraModel
 from chromeball.scene.errors import UserError
 from chromeball.scene.pose import Pose
@@ -37,8 +39,8 @@ FEWEST_FOR_NOISE = 6
 OUTLIER = 1e-3
 #: Medians of chi-squared with 3 and 2 degrees of freedom.
 MEDIAN_3, MEDIAN_2 = 2.366, 1.386
-#: The delay is searched so far to both sides, seconds, in steps of so much.
-SEARCH, STEP = 0.5, 0.01
+#: A given delay so many standard errors from the log's own is none.
+DELAY_OFF = 5.0
 
 
 @dataclass(frozen=True)
@@ -113,12 +115,13 @@ def solve_tracker(
     search
         How far the delay may be from zero, seconds.
     tell
-        Hears what was found on the way.
+        Hears what was found on the way, and warnings.
 
     Raises
     ------
     UserError
-        Too few pictures, a motion that leaves unknowns open, poses that fit no common motion.
+        Too few pictures, a motion that leaves unknowns open, poses that fit no common motion;
+        with the reading of the log under which they do, if there is one.
 
     """
     say = tell or (lambda _: None)
@@ -128,12 +131,81 @@ def solve_tracker(
         raise UserError("the log has times; the pictures' are needed, too")
     if not timed and len(log.positions) != count:
         raise UserError(f"{len(log.positions)} poses of the tracker for {count} pictures")
-    window = usual_window(log) if window is None else window
     views, boards = _place_boards(camera, points, pixels, say)
-    clock = np.asarray(times, float)[views] if timed and times is not None else np.zeros(0)
+    refuse_single_axis(boards.inverse())
+    task = _Task(
+        camera, points, pixels, views, boards,
+        times=np.asarray(times, float)[views] if timed and times is not None else np.zeros(0),
+        noises=(position_noise, rotation_noise), window=window, search=search,
+    )  # fmt: skip
+    delay = delay if timed else 0.0
+    try:
+        found = _solve(task, log, delay, say)
+    except UserError as error:
+        for words, other, shift, reach in alternatives(log, delay, search):
+            try:
+                fits = _solve(replace(task, search=reach), other, shift, lambda _: None)
+            except UserError:
+                continue  # neither this
+            raise UserError(
+                words.format(delay=fits.delay, search=2 * abs(fits.delay))
+            ) from error
+        raise
+    if timed and delay is not None:
+        _check_delay(task, log, found, say)
+    return found
+
+
+@dataclass(frozen=True)
+class _Task:
+    """What stays the same whatever is tried: pictures, their ``times`` (V,) and ``boards``."""
+
+    camera: CameraModel
+    points: Array
+    pixels: Array
+    views: NDArray[np.intp]
+    boards: Frames
+    times: Array
+    noises: tuple[float | None, float | None]
+    window: float | None
+    search: float
+
+
+def _check_delay(
+    task: _Task, log: TrackerLog, found: TrackerSolution, say: Callable[[str], object]
+) -> None:
+    """Warn of a given delay that the log contradicts."""
+    try:
+        free = _solve(task, log, None, lambda _: None)
+    except UserError:
+        return  # pictures at rest: they leave it open, and any will do
+    off, sigma = free.delay - found.delay, free.standard_errors[12]
+    better = free.noise.rotation <= found.noise.rotation and free.used.sum() >= found.used.sum()
+    if better and abs(off) > DELAY_OFF * sigma:
+        say(
+            f"warning: the log says that the delay is {free.delay * 1e3:.1f} +- "
+            f"{sigma * 1e3:.1f} ms, not {found.delay * 1e3:.1f} as given, and fits better so: "
+            "leave --delay out"
+        )
+
+
+def _solve(
+    task: _Task, log: TrackerLog, delay: float | None, say: Callable[[str], object]
+) -> TrackerSolution:
+    """The solution for one reading of the log; `delay` None is estimated."""
+    camera, points, pixels = task.camera, task.points, task.pixels
+    views, boards, clock = task.views, task.boards, task.times
+    timed, count = log.times is not None, len(pixels)
+    position_noise, rotation_noise = task.noises
+    window = usual_window(log) if task.window is None else task.window
     if timed and delay is None:
-        start = _search_delay(log, clock, boards, window, search)
+        start = search_delay(log, clock, boards, window, task.search)
         say(f"delay, roughly: {start * 1e3:.0f} ms")
+        if abs(start) > task.search - 1.5 * STEP:
+            say(
+                f"warning: that is at the limit of the search, {task.search:g} s: look farther "
+                f"with --search {2 * task.search:g}"
+            )
     else:
         start = delay or 0.0
     if timed:
@@ -176,7 +248,7 @@ def solve_tracker(
         used = fits
         _enough(int(used.sum()), None in given)
         state, noise = _settle(rows, state, noise, used, free_delay, given)
-    scale, sigma_scale = check_scale(rows, state, used)
+    scale, sigma_scale = check_scale(rows, state, used, say)
     refuse_unlike(rows, state, noise)
     spread, condition = covariance(rows, state, noise, used, free_delay)
     refuse_open(spread)
@@ -218,6 +290,8 @@ def _place_boards(
     poses: list[Pose] = []
     for k, view in enumerate(pixels):
         seen = np.isfinite(view).all(axis=-1)
+        if not seen.any():
+            continue  # no board: who looked for it has told
         try:
             found = solve_pose(camera, points[seen], view[seen], above_floor=False)
         except UserError as error:
@@ -260,44 +334,6 @@ def _upside_down(
         new_place <= FAR * np.median(place[agree])
     )
     return np.asarray(fits & ~agree, bool)
-
-
-def _search_delay(
-    log: TrackerLog, clock: Array, boards: Frames, window: float, search: float
-) -> float:
-    """The delay at which the angles between views are most alike for tracker and pictures.
-
-    The angle of a turn does not depend on X and Z.
-    """
-    i, j = np.triu_indices(len(clock), 1)
-    if len(i) > 4000:
-        chosen = np.random.default_rng(0).choice(len(i), 4000, replace=False)
-        i, j = i[chosen], j[chosen]
-    seen = _angles(boards.rotations, i, j)
-    best, least = 0.0, math.inf
-    reach = 0
-    for delay in sorted(np.arange(-search, search + STEP / 2, STEP).tolist(), key=abs):
-        inside = reached(log, clock + delay, window)
-        both = inside[i] & inside[j]
-        if inside.sum() < 3 or inside.sum() < 0.8 * reach:
-            continue
-        reach = max(reach, int(inside.sum()))
-        turned = np.zeros((len(clock), 3, 3))
-        turned[inside] = sample(log, clock[inside] + delay, window).rotations
-        told = _angles(turned, i[both], j[both])
-        error = float(np.median(np.abs(told - seen[both])))
-        if error < least - 1e-9:
-            best, least = delay, error
-    if not math.isfinite(least):
-        raise UserError(
-            "the log covers fewer than three of the pictures: are the clocks of both the same?"
-        )
-    return best
-
-
-def _angles(rotations: Array, i: NDArray[np.intp], j: NDArray[np.intp]) -> Array:
-    trace = np.einsum("pij,pij->p", rotations[i], rotations[j])
-    return np.arccos(np.clip((trace - 1) / 2, -1, 1))
 
 
 def _enough(count: int, estimated: bool) -> None:

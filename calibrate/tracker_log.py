@@ -47,13 +47,15 @@ GAP = 5.0
 class TrackerLog:
     """Poses ``tracker_from_sensor``: ``positions`` (N, 3) metres, ``rotations`` (N, 3, 3).
 
-    ``times`` (N,) in seconds, rising; or ``files`` the picture of each sample.
+    ``times`` (N,) in seconds, rising; or ``files`` the picture of each sample. ``angles``
+    (N, 3): azimuth, elevation and roll in degrees where the turns were written so.
     """
 
     positions: Array
     rotations: Array
     times: Array | None = None
     files: tuple[str, ...] | None = None
+    angles: Array | None = None
 
     @property
     def interval(self) -> float:
@@ -227,18 +229,20 @@ def read_log(path: str | os.PathLike[str]) -> TrackerLog:
     values = np.array(
         [[_number(row, c, k, path) for c in columns] for k, row in enumerate(rows)]
     )
-    rotations = _rotations(values[:, 3 : 3 + len(turns)], path)
+    written = values[:, 3 : 3 + len(turns)]
+    rotations = _rotations(written, path)
+    angles = None if quaternion else written
     positions = values[:, :3] * LENGTHS[unit]
     if not timed:
         files = tuple(str(row.get("file", "")) for row in rows)
-        return TrackerLog(positions, rotations, files=files)
+        return TrackerLog(positions, rotations, files=files, angles=angles)
     times = values[:, -1]
     if len(times) < 2:
         raise UserError("one sample is no log", file=path)
     if not (np.diff(times) > 0).all():
         late = int(np.argmin(np.diff(times) > 0)) + 2
         raise UserError(f"sample {late} is not later than the one before", file=path)
-    return TrackerLog(positions, rotations, times=times)
+    return TrackerLog(positions, rotations, times=times, angles=angles)
 
 
 def read_times(path: str | os.PathLike[str], files: Sequence[Path]) -> Array:

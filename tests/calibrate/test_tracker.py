@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -268,7 +270,9 @@ def refused(change: Callable[[Array, TrackerLog], tuple[Array, Array, TrackerLog
 
 
 def test_inputs_that_do_not_belong_together() -> None:
-    assert "0.76 times as far" in refused(lambda q, log: (POINTS * 1.3, q, log))
+    assert "times as far as the pictures say: measure the board's square, 0.7" in refused(
+        lambda q, log: (POINTS * 1.3, q, log)
+    )
     assert "motion is not the pictures'" in refused(
         lambda q, log: (POINTS, np.roll(q, 1, axis=0), log)
     )
@@ -280,6 +284,91 @@ def test_inputs_that_do_not_belong_together() -> None:
     assert "only 2 pictures place" in refused(
         lambda q, log: (POINTS, q * np.where(np.arange(12) < 2, 1, np.nan)[:, None, None], log)
     )
+
+
+def test_a_wrong_square_is_refused_and_a_small_error_told() -> None:
+    """A sound tracker's metre is true to 1 %; 5 % are a printer's."""
+    pixels, log = still(20, 5, noise=0.3)
+    heard: list[str] = []
+    solve_tracker(CAMERA, POINTS, pixels, log, tell=heard.append)
+    assert heard == []
+    found = solve_tracker(CAMERA, POINTS * 1.02, pixels, log, tell=heard.append)
+    assert found.scale == pytest.approx(1 / 1.02, abs=4 * found.sigma_scale)
+    assert len(heard) == 1
+    assert heard[0].startswith("warning: the tracker moved 0.98")
+    assert "measure the board's square" in heard[0]
+    with pytest.raises(UserError, match=r"moved 0\.95\d \+- .* measure the board's square"):
+        solve_tracker(CAMERA, POINTS * 1.05, pixels, log)
+
+
+def test_a_wrong_given_delay_is_told() -> None:
+    pixels, log, clock = moving(2)
+    heard: list[str] = []
+    solve_tracker(CAMERA, POINTS, pixels, log, clock, delay=DELAY, tell=heard.append)
+    assert heard == []
+    found = solve_tracker(CAMERA, POINTS, pixels, log, clock, delay=0.0, tell=heard.append)
+    assert found.delay == 0
+    assert re.search(r"warning: the log says that the delay is 4[67]\.\d \+- ", heard[-1])
+    assert log.times is not None
+    late = replace(log, times=log.times + 0.073)
+    with pytest.raises(
+        UserError, match=r"delay 0 s that was given, but with 0\.1[12]\d s it does"
+    ):
+        solve_tracker(CAMERA, POINTS, pixels, late, clock, delay=0.0)
+
+
+def test_a_delay_beyond_the_search() -> None:
+    pixels, log, clock = moving(2)
+    assert log.times is not None
+    far = replace(log, times=log.times + 0.9)
+    with pytest.raises(UserError, match=r"delay of 0\.947 s, farther .* add --search 1\.9"):
+        solve_tracker(CAMERA, POINTS, pixels, far, clock)
+    heard: list[str] = []
+    solve_tracker(CAMERA, POINTS, pixels, log, clock, search=0.05, tell=heard.append)
+    assert any("at the limit of the search, 0.05 s" in line for line in heard)
+
+
+def quaternions(order: list[int], log: TrackerLog) -> TrackerLog:
+    """The log with x, y, z, w in another order."""
+    turns = Rotation.from_matrix(log.rotations).as_quat()[:, order]
+    return replace(log, rotations=Rotation.from_quat(turns).as_matrix())
+
+
+def euler(seq: str, factor: float, order: list[int], log: TrackerLog) -> TrackerLog:
+    """The log's angles, in the order z, y, x, written otherwise."""
+    angles = Rotation.from_matrix(log.rotations).as_euler(seq, degrees=True)[:, order] * factor
+    turns = Rotation.from_euler("ZYX", angles, degrees=True).as_matrix()
+    return replace(log, rotations=turns, angles=angles)
+
+
+@pytest.mark.parametrize(
+    ("written", "message"),
+    [
+        (lambda log: replace(log, rotations=log.rotations.swapaxes(1, 2)), "signs of qx, qy"),
+        (partial(quaternions, [1, 2, 3, 0]), "named qw, qx, qy, qz hold x, y, z, w"),
+        (partial(quaternions, [3, 0, 1, 2]), "named qx, qy, qz, qw hold w, x, y, z"),
+        (lambda log: replace(log, positions=-log.positions), "left-handed, or the pictures"),
+        (partial(euler, "ZYX", 1.0, [2, 1, 0]), "hold roll, elevation, azimuth"),
+        (partial(euler, "ZYX", 1.0, [1, 2, 0]), "hold elevation, roll, azimuth"),
+        (partial(euler, "ZYX", math.pi / 180, [0, 1, 2]), "its angles are radians"),
+        (partial(euler, "zyx", 1.0, [0, 1, 2]), "axes that stay"),
+    ],
+)
+def test_another_reading_that_fits_is_named(
+    written: Callable[[TrackerLog], TrackerLog], message: str
+) -> None:
+    pixels, log = still(10, 3)
+    with pytest.raises(UserError, match=f"fits the pictures only if .*{message}"):
+        solve_tracker(CAMERA, POINTS, pixels, written(log))
+
+
+def test_pictures_without_a_board_are_told_by_who_looked() -> None:
+    pixels, log = still(10, 3)
+    pixels[[2, 7]] = np.nan
+    heard: list[str] = []
+    found = solve_tracker(CAMERA, POINTS, pixels, log, tell=heard.append)
+    assert found.used.sum() == 8
+    assert heard == []
 
 
 # ---- the log

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -70,7 +71,7 @@ def tracker(
     from chromeball.calibrate.target import parse_target
     from chromeball.calibrate.tracker import solve_tracker
     from chromeball.calibrate.tracker_file import figures, write_tracker
-    from chromeball.calibrate.tracker_log import TrackerLog, read_log, read_times
+    from chromeball.calibrate.tracker_log import read_log, read_times
     from chromeball.calibrate.tracker_plot import plot_differences
 
     for name, value in (
@@ -104,8 +105,12 @@ def tracker(
         if missing := [f for f in images if f.name not in at]:
             raise UserError(f"says nothing of {missing[0].name}", file=log)
         k = [at[f.name] for f in images]
-        samples = TrackerLog(
-            samples.positions[k], samples.rotations[k], files=tuple(map(str, k))
+        samples = replace(
+            samples,
+            positions=samples.positions[k],
+            rotations=samples.rotations[k],
+            files=tuple(map(str, k)),
+            angles=None if samples.angles is None else samples.angles[k],
         )
     inputs = [*images, camera, log, *([times] if times else [])]
     options = {
