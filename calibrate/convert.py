@@ -14,6 +14,8 @@ from chromeball.scene.errors import UserError
 
 #: Models of pictures in a plane: they end 90 degrees from the axis.
 FLAT = ("pinhole", "LENSMODEL_OPENCV", "LENSMODEL_PINHOLE")
+#: mrcal's, between perspective (linearity 1) and fisheye (0).
+CAHVORE = "LENSMODEL_CAHVORE_linearity=0.37"
 #: More rays say no more.
 _ENOUGH = 600
 #: Directions nearer than this to the plane of the lens (cosine) say nothing of a flat model.
@@ -60,18 +62,24 @@ def fitted(
     """
     from scipy.optimize import least_squares
 
+    free = free_terms(start.model)
+
+    def at(values: NDArray[np.float64]) -> CameraModel:
+        intrinsics = start.intrinsics.copy()
+        intrinsics[free] = values
+        return replace(start, intrinsics=intrinsics)
+
     def miss(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        q, _, _ = gradients(replace(start, intrinsics=values), rays)
-        return np.nan_to_num((q - pixels).ravel(), nan=1e6)
+        return np.nan_to_num((gradients(at(values), rays)[0] - pixels).ravel(), nan=1e6)
 
     def slope(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        _, _, by = gradients(replace(start, intrinsics=values), rays)
-        return np.nan_to_num(by.reshape(-1, len(values)))
+        by = gradients(at(values), rays)[2]
+        return np.nan_to_num(by.reshape(-1, len(free))[:, free])
 
     # Terms that hardly differ over these rays would be followed for ever.
     solve: Any = least_squares
-    found = solve(miss, start.intrinsics, slope, x_scale="jac", ftol=1e-6, max_nfev=60)
-    return replace(start, intrinsics=found.x), float(np.sqrt(2 * np.mean(found.fun**2)))
+    found = solve(miss, start.intrinsics[free], slope, x_scale="jac", ftol=1e-6, max_nfev=60)
+    return at(found.x), float(np.sqrt(2 * np.mean(found.fun**2)))
 
 
 def _start(camera: CameraModel, model: str) -> CameraModel:
@@ -85,6 +93,19 @@ def _start(camera: CameraModel, model: str) -> CameraModel:
     else:
         values[:4] = [fx, fy, cx, cy]
     return CameraModel(model, values, camera.size, camera.world_from_camera)
+
+
+def free_terms(model: str) -> NDArray[np.bool_]:
+    """Which of a model's intrinsics are its own to choose, (k,).
+
+    CAHVORE's r0 does what the focal length does, and its E is the travel of the pupil, which
+    :class:`chromeball.calibrate.adjust.Estimate` has for all models: with it mrcal cannot turn
+    pixels into rays. Both stay zero.
+    """
+    free = np.ones(parameters(model), bool)
+    if model == CAHVORE:
+        free[[6, 9, 10, 11]] = False
+    return free
 
 
 def parameters(model: str) -> int:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from chromeball.calibrate import solve_mrcal
 from chromeball.calibrate.aprilgrid import AprilGrid
-from chromeball.calibrate.convert import parameters
+from chromeball.calibrate.convert import CAHVORE, parameters
 from chromeball.calibrate.lens_result import Lens, check_count
 from chromeball.calibrate.solve import (
     FISHEYES,
@@ -27,7 +27,7 @@ from chromeball.calibrate.target import Target
 from chromeball.scene.errors import UserError
 
 OPENCV = ("opencv4", "opencv5", "opencv8")
-MODELS = ("auto", "pinhole", *OPENCV, "splined", *FISHEYES)
+MODELS = ("auto", "pinhole", *OPENCV, "splined", "cahvore", *FISHEYES)
 FEWEST_VIEWS = 3
 
 
@@ -60,13 +60,14 @@ def calibrate_lens(
             "an AprilGrid: take another model"
         )
     name = f"LENSMODEL_{model.upper()}" if model in OPENCV else model
+    name = CAHVORE if model == "cahvore" else name
     check_count(corners, model, 4 if model == "splined" else parameters(name))
     start = fit_start(corners, target, size) if start is None else start
     if model == "splined":
         start = fit_model(start, corners, target, "kb4")
         return solve_mrcal.solve_splined(start, corners, target, paths)
     fit = fit_model(start, corners, target, name)
-    if model in FISHEYES or isinstance(target, AprilGrid):
+    if model in ("cahvore", *FISHEYES) or isinstance(target, AprilGrid):
         return judge(fit, corners, target)
     return solve_mrcal.refine(fit, corners, target, paths)
 

@@ -66,6 +66,8 @@ class Lens:
             return ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2")[:count]
         if model.startswith("LENSMODEL_SPLINED"):
             return (*OPENCV_NAMES[:4], *(f"s{i}" for i in range(count - 4)))
+        if model.startswith("LENSMODEL_CAHVORE"):
+            return (*OPENCV_NAMES[:4], "alpha", "beta", "r0", "r1", "r2", "e0", "e1", "e2")
         return OPENCV_NAMES[:count] if count > 3 else ("f", "cx", "cy")
 
     def write(self, path: str | os.PathLike[str]) -> None:

@@ -22,7 +22,7 @@ from chromeball.calibrate.adjust import (
     covariance,
     residuals,
 )
-from chromeball.calibrate.convert import converted, parameters
+from chromeball.calibrate.convert import CAHVORE, converted, free_terms
 from chromeball.calibrate.lens_result import (
     LEAST_TILT,
     PARALLEL,
@@ -119,7 +119,7 @@ def fit_model(
     """The lens of `model`, a :class:`CameraModel`'s, that explains the corners best.
 
     `start` may be of the same corners or of others of the same lens. Without `travel` the
-    entrance pupil of a kb4 stands still, too.
+    entrance pupil of a kb4 or CAHVORE stands still, too.
 
     Raises
     ------
@@ -136,13 +136,14 @@ def fit_model(
     if len(placed) < 3:
         raise UserError(UNEXPLAINED)
     estimate = replace(estimate, pupil=np.zeros(2))
-    still = np.arange(parameters(model) + 4) < parameters(model) + 2
+    still = np.concatenate([free_terms(model), [True, True, False, False]])
+    moving_too = np.concatenate([free_terms(model), [True] * 4])
     estimate = _robust(estimate, board, corners[placed], found[placed], still)
     # A lens of one parameter would bend by the pupil what it cannot bend itself.
-    if travel and model.startswith("kb4"):
-        moving = _robust(estimate, board, corners[placed], found[placed], still | True)
+    if travel and model.startswith(("kb4", CAHVORE)):
+        moving = _robust(estimate, board, corners[placed], found[placed], moving_too)
         if _earned(estimate, moving, board, corners[placed]):
-            return _settle(placed, moving, board, corners, found, still | True)
+            return _settle(placed, moving, board, corners, found, moving_too)
     return _settle(placed, estimate, board, corners, found, still)
 
 
@@ -291,7 +292,9 @@ def judge(fit: Fit, corners: NDArray[np.float64], target: Target) -> Lens:
         corners[placed],
         used,
         _precision(estimate.camera, board, sigma),
-        np.arange(count + 4) < (count + 4 if estimate.pupil.any() else count + 2),
+        np.concatenate(
+            [free_terms(estimate.camera.model), [True, True], [bool(estimate.pupil.any())] * 2]
+        ),
     )
     spread = sigma**2 * spread[:count, :count]
     check_focal(estimate.camera.intrinsics, np.sqrt(np.diag(spread)), 2 if count > 3 else 1)

@@ -121,6 +121,30 @@ def test_richer_models_predict_as_well(model: str) -> None:
     assert np.median(errors) < 1.25 * np.sqrt(2) * NOISE
 
 
+def test_cahvore() -> None:
+    """Gennery's lens comes back, its moving pupil told beside it, and mrcal reads the rest."""
+    truth = np.array([500.0, 501, 321, 242, 0.01, -0.015, 0, -0.15, 0.04, 0, 0, 0])
+    camera = CameraModel("LENSMODEL_CAHVORE_linearity=0.37", truth, SIZE)
+    poses = board_poses(BOARD, camera, 14, seed=1)
+    corners = project(BOARD, camera, poses, noise=NOISE, seed=1)
+    lens = calibrate_lens(corners, BOARD, SIZE, "cahvore")
+    own = lens.standard_errors > 0
+    assert own.sum() == 8
+    off = (lens.camera.intrinsics - truth)[own] / lens.standard_errors[own]
+    assert np.abs(off).max() < 4
+    np.testing.assert_array_equal(lens.camera.intrinsics[~own], 0)
+    np.testing.assert_array_equal(lens.pupil, 0)
+    assert lens.names[7] == "r1"
+    rays = lens.camera.unproject(corners[0])
+    np.testing.assert_allclose(lens.camera.project(rays), corners[0], atol=1e-3)
+
+    travelling = project(BOARD, camera, poses, noise=NOISE, seed=1, pupil=0.04)
+    lens = calibrate_lens(travelling, BOARD, SIZE, "cahvore")
+    off = (lens.camera.intrinsics - truth)[own] / lens.standard_errors[own]
+    assert np.abs(off).max() < 4
+    assert lens.pupil @ [0.25, 0.0625] == pytest.approx(0.04 * 0.25, rel=0.3)
+
+
 def test_focal_lengths_need_no_guess() -> None:
     for focal in (200.0, 420.0, 1500.0, 4000.0):
         camera = CameraModel("pinhole", np.array([focal, focal, 325, 235]), SIZE)

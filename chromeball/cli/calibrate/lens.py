@@ -43,7 +43,7 @@ def lens(
         auto is the simplest that predicts pictures left out of the solution as well as any;
         or pinhole, opencv4, opencv5, opencv8, splined; kb4 for fisheyes beyond 180 degrees, too
         (Kannala and Brandt), kb4_decentred (with elements off the axis), equidistant,
-        equisolid, stereographic.
+        equisolid, stereographic; cahvore (Gennery's, its moving pupil as kb4's).
     watch
         Instead of pictures a folder into which they come: each is looked at when it is whole,
         and verdict and advice are told again. Ends with Ctrl-C, after so many views, or when
