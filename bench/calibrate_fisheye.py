@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from bench.row import Row
 from chromeball.calibrate.choose import pose_errors, view_errors
-from chromeball.calibrate.detect import detect_files
 from chromeball.calibrate.lens import calibrate_lens
+from chromeball.calibrate.search import detect_files
 from chromeball.calibrate.target import Chessboard
 from chromeball.calibrate.view_poses import pose_residuals
 from chromeball.calibrate.virtual import project, surrounding_poses

@@ -9,12 +9,9 @@ centroids (:mod:`chromeball.calibrate.circles`).
 
 from __future__ import annotations
 
-import multiprocessing
 import os
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +19,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from chromeball.calibrate import detect_cache
 from chromeball.calibrate.aprilgrid import AprilGrid
 from chromeball.calibrate.circles import detect_circles
 from chromeball.calibrate.coded import find_coded, is_mirrored
@@ -30,7 +26,6 @@ from chromeball.calibrate.detection import Detection
 from chromeball.calibrate.grow import Found, likeness, refit
 from chromeball.calibrate.printed import Printed, board_of
 from chromeball.calibrate.target import Charuco, Chessboard, CircleGrid, Target
-from chromeball.scene.errors import UserError
 from chromeball.scene.image import Image, read_image, to_display
 
 #: Half of the refinement window on a chessboard, in pitches.
@@ -39,52 +34,8 @@ WINDOW = 0.30
 FEWEST = 8
 #: Larger pictures are searched at this width first; refinement is always at full size.
 SEARCH_WIDTH = 1600
-#: Pictures for each further process that are worth its start.
-WORTH = 4
 #: So many pictures are looked at for a board of other counts.
 TRIED = 4
-
-
-def detect_files(
-    files: Sequence[str | os.PathLike[str]],
-    target: Target,
-    progress: Callable[[Detection], object] | None = None,
-    *,
-    workers: int = 1,
-    cache: Path | None = None,
-) -> list[Detection]:
-    """Look for `target` in every picture; `progress` hears of each, in their order.
-
-    Up to `workers` processes share the pictures. Detections are kept in the folder `cache`, if
-    it is given, and pictures known there are not searched again.
-
-    Raises
-    ------
-    UserError
-        When a picture cannot be read, the sizes differ, or no picture shows the board.
-
-    """
-    detections: list[Detection] = []
-    for detection in _detections([Path(f) for f in files], target, workers, cache):
-        if detections and detection.size != detections[0].size:
-            raise UserError(
-                "this picture is {}x{}, {} is {}x{}: pictures of one lens have one size".format(
-                    *detection.size, detections[0].file, *detections[0].size
-                ),
-                file=detection.file,
-            )
-        detections.append(detection)
-        if progress is not None:
-            progress(detection)
-    if not any(detection.usable for detection in detections):
-        names = (
-            detections[0].file if len(detections) == 1 else f"any of {len(detections)} pictures"
-        )
-        raise UserError(
-            f"the board {target.spec} was not seen in {names}: "
-            f"{counts_hint(files, target)}, focus and light"
-        )
-    return detections
 
 
 def counts_hint(files: Sequence[str | os.PathLike[str]], target: Target) -> str:
@@ -131,42 +82,6 @@ def other_counts(picture: NDArray[np.uint8]) -> tuple[int, int] | None:
     flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_LARGER
     found, _, kinds = cv2.findChessboardCornersSBWithMeta(small, (3, 3), flags)
     return (max(kinds.shape), min(kinds.shape)) if found else None
-
-
-def _detections(
-    files: list[Path], target: Target, workers: int, cache: Path | None
-) -> Iterator[Detection]:
-    """Of each file in turn."""
-    search = partial(_detection, target=target, cache=cache)
-    processes = min(workers, len(files) // WORTH)
-    if processes < 2:
-        yield from map(search, files)
-        return
-    # Not forked: what runs in threads here, as OpenCV and JAX do, would hang in the copy.
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(processes, context, _one_thread) as pool:
-        try:
-            yield from pool.map(search, files)
-        finally:
-            pool.shutdown(cancel_futures=True)
-
-
-def _one_thread() -> None:
-    """Every process has a core to itself."""
-    cv2.setNumThreads(1)
-
-
-def _detection(file: Path, target: Target, cache: Path | None) -> Detection:
-    kept: Path | None = None
-    if cache is not None and file.is_file():
-        kept = detect_cache.entry(cache, file, target)
-        known = detect_cache.load(kept, file)
-        if known is not None:
-            return known
-    detection = judge(file, grey(read_image(file)), target)
-    if kept is not None:
-        detect_cache.store(kept, detection)
-    return detection
 
 
 def judge(file: Path, picture: NDArray[np.uint8], target: Target) -> Detection:

@@ -37,9 +37,10 @@ def default_folder() -> Path:
     return Path(os.environ.get("CHROMEBALL_CACHE") or Path(base) / "chromeball") / "detections"
 
 
-def entry(folder: Path, file: Path, target: Target) -> Path:
-    """Where the detection of `target` in `file` is kept."""
-    text = f"{_version()} {content_hash(file)} {target!r} {file.suffix.lower()}"
+def entry(folder: Path, file: Path, target: Target, frame: int | None = None) -> Path:
+    """Where the detection of `target` in `file`, or a `frame` of that video, is kept."""
+    number = "" if frame is None else f" frame {frame}"
+    text = f"{_version()} {_content(file)} {target!r} {file.suffix.lower()}{number}"
     return folder / f"{hashlib.blake2b(text.encode(), digest_size=16).hexdigest()}.npz"
 
 
@@ -87,6 +88,17 @@ def store(path: Path, detection: Detection) -> None:
             blur=np.float64(detection.blur),
             facts=np.array(json.dumps(facts)),
         )
+
+
+def _content(file: Path) -> str:
+    state = file.stat()
+    return _hash(file, state.st_size, state.st_mtime_ns)
+
+
+@functools.lru_cache
+def _hash(file: Path, _size: int, _changed: int) -> str:
+    """Of a file as it now is: a video is not read again for each of its frames."""
+    return content_hash(file)
 
 
 @functools.cache

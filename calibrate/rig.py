@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from chromeball.calibrate import rig_solve
 from chromeball.calibrate.lens_result import check_focal, outline
+from chromeball.calibrate.rig_check import check_copies, check_fit
 from chromeball.calibrate.rig_lenses import (
     DOUBTED_LENS,
     WRONG_LENS,
@@ -61,6 +62,7 @@ def calibrate_rig(
     known: Mapping[str, CameraModel] | None = None,
     refine: bool = False,
     stamps: NDArray[np.float64] | None = None,
+    labels: Sequence[str] | None = None,
     progress: Callable[[str], object] | None = None,
 ) -> RigSolution:
     """Lenses and poses of all cameras of a rig.
@@ -78,6 +80,8 @@ def calibrate_rig(
         Lenses that are given, by their cameras' names, and whether to refine them.
     stamps
         When each frame was taken, (C, F) seconds; only then can clocks be solved for.
+    labels
+        Names of the instants; their numbers from 0 where they are not given.
     progress
         Hears of each step.
 
@@ -100,6 +104,7 @@ def calibrate_rig(
     corners = corners.copy()
     corners[:, list(repeated)] = np.nan
     _check_boards(corners, names)
+    check_copies(corners, names)
     alone: list[Alone] = []
     for name, views, size, model in zip(names, corners, sizes, models, strict=True):
         alone.append(_alone(name, views, target, size, model, given.get(name)))
@@ -168,6 +173,10 @@ def calibrate_rig(
         error = rig_solve.residuals(estimate, board, corners)
         error[~used] = np.nan
     _check_connected(error, names)
+    seen = np.where(saw[..., None, None], poses, np.nan)
+    told = labels or [str(v) for v in range(corners.shape[1])]
+    if sync is None:
+        check_fit(corners, error, seen, sigma / share, names, told)
     return RigSolution(
         names=tuple(names),
         cameras=tuple(

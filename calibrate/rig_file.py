@@ -20,6 +20,7 @@ from chromeball.scene.record import decode, write_json
 
 if TYPE_CHECKING:
     from chromeball.calibrate.rig_result import RigSolution
+    from chromeball.calibrate.wand_result import WandRig
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,7 @@ class RigCamera:
     about its own axes (radians) and its position on the rig (metres), given the first camera's.
     ``rms`` per corner and ``sigma``, the deviation of a coordinate, in pixels. In seconds: its
     pictures were taken ``time_offset`` after their stamps, their rows over ``readout``;
-    None where that was not estimated.
+    None where that was not estimated. ``delay_frames``: the same of recordings without stamps.
     """
 
     name: str
@@ -42,19 +43,25 @@ class RigCamera:
     time_offset_error: float | None
     readout: float | None
     readout_error: float | None
+    delay_frames: float | None = None
 
 
 @dataclass(frozen=True)
 class Rig:
-    """Cameras that hold together; the first is the rig's origin.
+    """Cameras that hold together.
 
-    ``covariance`` (6C, 6C) of all poses jointly, in the order of ``cameras``; ``bow`` (2,) the
-    board's deflection along x and y, metres.
+    ``unit`` of all lengths, "m" but where nothing told the scale; ``gauge`` says what the
+    standard errors are relative to. ``covariance`` (6C, 6C) of all poses jointly, in the order
+    of ``cameras``, and ``bow`` (2,), the board's deflection along x and y in metres: None
+    without a board. ``pairs`` name two cameras and count the boards that both saw.
     """
 
     cameras: tuple[RigCamera, ...]
-    covariance: NDArray[np.float64]
-    bow: NDArray[np.float64]
+    gauge: str
+    unit: str = "m"
+    covariance: NDArray[np.float64] | None = None
+    bow: NDArray[np.float64] | None = None
+    pairs: tuple[tuple[str, str, int], ...] = ()
 
     def __getitem__(self, name: str) -> RigCamera:
         """The camera of that name; a :class:`UserError` where there is none."""
@@ -65,7 +72,16 @@ class Rig:
         raise UserError(f"the rig has no camera {name!r}; its cameras are {names}")
 
     def distance(self, a: str, b: str) -> tuple[float, float]:
-        """Distance of two cameras and its standard error, metres."""
+        """Distance of two cameras and its standard error, in the rig's unit.
+
+        Raises
+        ------
+        UserError
+            When there is no such camera, or the errors of the two are not known jointly.
+
+        """
+        if self.covariance is None:
+            raise UserError(f"how {a} and {b} err together is not known: {self.gauge}")
         places = {camera.name: i for i, camera in enumerate(self.cameras)}
         between = (
             self[b].camera.world_from_camera.translation
@@ -96,6 +112,7 @@ class _Camera(msgspec.Struct):
     time_offset_error: float | None
     readout: float | None
     readout_error: float | None
+    delay_frames: float | None
 
 
 class _Pair(msgspec.Struct):
@@ -104,9 +121,11 @@ class _Pair(msgspec.Struct):
 
 
 class _Rig(msgspec.Struct):
+    unit: str
+    gauge: str
     cameras: list[_Camera]
-    covariance: list[list[float]]
-    bow: tuple[float, float]
+    covariance: list[list[float]] | None
+    bow: tuple[float, float] | None
     pairs: list[_Pair]
 
 
@@ -128,12 +147,38 @@ def rig_of(solution: RigSolution) -> Rig:
                 readout_error=float(sync.readout_errors[c]) if sync and rolled else None,
             )
         )
-    return Rig(tuple(cameras), solution.covariance, solution.bow)
+    common = solution.common
+    pairs = tuple(
+        (solution.names[a], solution.names[b], int(common[a, b]))
+        for a, b in combinations(range(len(solution.names)), 2)
+    )
+    gauge = f"the pose of {solution.names[0]} counts as exact"
+    return Rig(tuple(cameras), gauge, "m", solution.covariance, solution.bow, pairs)
 
 
-def write_rig(path: str | os.PathLike[str], solution: RigSolution) -> None:
+def rig_of_wand(found: WandRig, rate: float | None) -> Rig:
+    """The same of lights in motion, recorded at `rate` frames a second if that is known."""
+    rms = found.camera_rms()
+    cameras = tuple(
+        RigCamera(
+            name=name,
+            camera=camera,
+            covariance=found.covariance[c],
+            rms=float(rms[c]),
+            sigma=found.sigma,
+            time_offset=None if rate is None else float(found.delays[c]) / rate,
+            time_offset_error=None if rate is None else float(found.delay_errors[c]) / rate,
+            readout=None,
+            readout_error=None,
+            delay_frames=float(found.delays[c]),
+        )
+        for c, (name, camera) in enumerate(zip(found.names, found.cameras, strict=True))
+    )
+    return Rig(cameras, found.gauge(), found.unit)
+
+
+def write_rig(path: str | os.PathLike[str], rig: Rig) -> None:
     """Write ``rig.json``, whole or not at all."""
-    rig = rig_of(solution)
     cameras = [
         {
             "name": own.name,
@@ -150,18 +195,19 @@ def write_rig(path: str | os.PathLike[str], solution: RigSolution) -> None:
             "time_offset_error": own.time_offset_error,
             "readout": own.readout,
             "readout_error": own.readout_error,
+            "delay_frames": own.delay_frames,
         }
         for own in rig.cameras
     ]
-    common = solution.common
-    pairs = [
-        {"cameras": (solution.names[a], solution.names[b]), "boards": int(common[a, b])}
-        for a, b in combinations(range(len(solution.names)), 2)
-    ]
-    write_json(
-        path,
-        {"cameras": cameras, "covariance": rig.covariance, "bow": rig.bow, "pairs": pairs},
-    )
+    told = {
+        "unit": rig.unit,
+        "gauge": rig.gauge,
+        "cameras": cameras,
+        "covariance": rig.covariance,
+        "bow": rig.bow,
+        "pairs": [{"cameras": (a, b), "boards": boards} for a, b, boards in rig.pairs],
+    }
+    write_json(path, told)
 
 
 def read_rig(path: str | os.PathLike[str]) -> Rig:
@@ -178,7 +224,6 @@ def read_rig(path: str | os.PathLike[str]) -> Rig:
     except OSError as error:
         raise UserError(f"cannot be read: {error.strerror}", file=path) from error
     read = decode(content, _Rig, path)
-    covariance = _square(read.covariance, 6 * len(read.cameras), path)
     cameras: list[RigCamera] = []
     for own in read.cameras:
         try:
@@ -195,9 +240,18 @@ def read_rig(path: str | os.PathLike[str]) -> Rig:
             RigCamera(
                 own.name, camera, _square(own.covariance, 6, path), own.rms, own.sigma,
                 own.time_offset, own.time_offset_error, own.readout, own.readout_error,
+                own.delay_frames,
             )
         )  # fmt: skip
-    return Rig(tuple(cameras), covariance, np.array(read.bow, float))
+    jointly = read.covariance
+    return Rig(
+        tuple(cameras),
+        read.gauge,
+        read.unit,
+        None if jointly is None else _square(jointly, 6 * len(cameras), path),
+        None if read.bow is None else np.array(read.bow, float),
+        tuple((*pair.cameras, pair.boards) for pair in read.pairs),
+    )
 
 
 def _square(

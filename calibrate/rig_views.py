@@ -18,10 +18,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from chromeball.calibrate.detect import FEWEST, grey, judge
+from chromeball.calibrate import detect_cache
+from chromeball.calibrate.detect import FEWEST
+from chromeball.calibrate.detection import Detection
+from chromeball.calibrate.search import Frame, search
 from chromeball.calibrate.target import Target
 from chromeball.scene.errors import UserError
-from chromeball.scene.image import read_image
 
 VIDEOS = {".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg"}
 NO_PICTURES = {".csv", ".json", ".txt", ".toml", ".yaml", ".yml", ".md", ".vnl", ".cameramodel"}
@@ -124,9 +126,11 @@ def look(
     plan: Plan,
     target: Target,
     *,
+    workers: int = 1,
+    cache: Path | None = None,
     progress: Callable[[str], object] | None = None,
 ) -> Views:
-    """Find the board in all pictures of the `plan`.
+    """Find the board in all pictures of the `plan`, as :func:`chromeball.calibrate.search`.
 
     Raises
     ------
@@ -134,38 +138,47 @@ def look(
         When a picture cannot be read, or one camera's pictures have several sizes.
 
     """
+    where = [(c, int(v)) for c, own in enumerate(plan.frames) for v in _in_order(own)]
+    pictures = (
+        picture
+        for source, own in zip(sources, plan.frames, strict=True)
+        for picture in _pictures(source, own[_in_order(own)], target, cache)
+    )
     corners = np.full((*plan.frames.shape, target.rows, target.columns, 2), np.nan)
-    sizes: list[tuple[int, int]] = []
+    sizes = dict[int, tuple[int, int]]()
+    verdicts: list[list[str]] = [[] for _ in sources]
+    found = search(pictures, len(where), target, workers=workers, cache=cache)
+    for (c, v), seen in zip(where, found, strict=True):
+        name, size = sources[c].name, sizes.setdefault(c, seen.size)
+        if seen.size != size:
+            raise UserError(
+                "this picture is {}x{}, others of camera {} are {}x{}: pictures of one "
+                "camera have one size".format(*seen.size, name, *size),
+                file=seen.file,
+            )
+        verdicts[c].append(seen.verdict)
+        if seen.usable:
+            corners[c, v] = seen.corners
+        if progress is not None:
+            progress(f"{name} {plan.labels[v]}: {seen.verdict}")
     for c, source in enumerate(sources):
-        wanted = {int(frame): v for v, frame in enumerate(plan.frames[c]) if frame >= 0}
-        size: tuple[int, int] | None = None
-        verdicts: list[str] = []
-        for frame, path, picture in _pictures(source, sorted(wanted)):
-            if size is not None and picture.shape[::-1] != size:
-                raise UserError(
-                    "this picture is {}x{}, others of camera {} are {}x{}: pictures of one "
-                    "camera have one size".format(*picture.shape[::-1], source.name, *size),
-                    file=path,
-                )
-            size = (picture.shape[1], picture.shape[0])
-            seen = judge(path, picture, target)
-            verdicts.append(seen.verdict)
-            if seen.usable:
-                corners[c, wanted[frame]] = seen.corners
-            if progress is not None:
-                label = plan.labels[wanted[frame]]
-                progress(f"{source.name} {label}: {seen.verdict}")
-        if size is None:
+        if c not in sizes:
             raise UserError(f"camera {source.name} has no picture of any instant")
-        sizes.append(size)
         if not np.isfinite(corners[c]).any():
-            common = max(set(verdicts), key=verdicts.count)
+            common = max(set(verdicts[c]), key=verdicts[c].count)
             raise UserError(
                 f"camera {source.name}: the board {target.spec} is usable in none of its "
-                f"{len(verdicts)} pictures ({common}): check its counts (a chessboard's are "
+                f"{len(verdicts[c])} pictures ({common}): check its counts (a chessboard's are "
                 f"inner corners), focus and light; {FEWEST} corners are needed"
             )
-    return Views(tuple(s.name for s in sources), tuple(sizes), corners, plan)
+    known = tuple(sizes[c] for c in range(len(sources)))
+    return Views(tuple(s.name for s in sources), known, corners, plan)
+
+
+def _in_order(frames: NDArray[np.intp]) -> NDArray[np.intp]:
+    """The instants that have a frame, in the order of the frames: videos run forwards."""
+    there = np.flatnonzero(frames >= 0)
+    return there[np.argsort(frames[there], kind="stable")]
 
 
 # ---- sources
@@ -213,24 +226,34 @@ def _frame_count(source: Source) -> int:
 
 
 def _pictures(
-    source: Source, wanted: Sequence[int]
-) -> Iterator[tuple[int, Path, NDArray[np.uint8]]]:
-    """Index, file and grey picture of each of the `wanted` frames."""
+    source: Source, wanted: NDArray[np.intp], target: Target, cache: Path | None
+) -> Iterator[Path | Frame | Detection]:
+    """The `wanted` frames, ascending; of videos as detections where these are known."""
     if source.video is None:
-        for frame in wanted:
-            yield frame, source.files[frame], grey(read_image(source.files[frame]))
+        yield from (source.files[frame] for frame in wanted)
         return
     import cv2
 
-    capture, left = _capture(source.video), set(wanted)
-    for frame in range(max(left, default=-1) + 1):
-        if not capture.grab():
-            raise UserError(
-                f"the video ends at frame {frame}, before its time", file=source.video
-            )
-        if frame in left:
-            _, picture = capture.retrieve()
-            yield frame, source.video, np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY))
+    known = dict[int, Detection]()
+    if cache is not None:
+        for frame in wanted:
+            kept = detect_cache.entry(cache, source.video, target, int(frame))
+            if (seen := detect_cache.load(kept, source.video)) is not None:
+                known[int(frame)] = seen
+    capture, at = _capture(source.video), -1
+    for frame in map(int, wanted):
+        if frame in known:
+            yield known[frame]
+            continue
+        while at < frame:
+            if not capture.grab():
+                raise UserError(
+                    f"the video ends at frame {at + 1}, before its time", file=source.video
+                )
+            at += 1
+        _, picture = capture.retrieve()
+        pixels = np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), np.uint8)
+        yield Frame(source.video, frame, pixels)
 
 
 # ---- pairs

@@ -1,4 +1,4 @@
-"""Tracks of lights as MultiCamSelfCal keeps them, its lenses, and the folder of a rig.
+"""Tracks of lights as MultiCamSelfCal keeps them, and its lenses.
 
 A folder holds ``points.dat`` (3C, F): x, y and 1 of each camera and frame; ``IdMat.dat``
 (C, F): 1 where the light was seen; ``Res.dat`` (C, 2): width and height; and, if it likes,
@@ -16,10 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chromeball.calibrate.formats import read_camera
-from chromeball.calibrate.wand_result import Tracks, WandRig
+from chromeball.calibrate.wand_result import Tracks
 from chromeball.scene.camera import CameraModel
 from chromeball.scene.errors import UserError
-from chromeball.scene.record import Stage, write_json
 
 #: Numbers of a ``.rad``: focal lengths, principal point, distortion.
 RAD = ("K11", "K22", "K13", "K23", "kc1", "kc2", "kc3", "kc4")
@@ -92,23 +91,6 @@ def read_centres(path: str | os.PathLike[str], count: int) -> NDArray[np.float64
     if centres.shape != (count, 3) or not np.isfinite(centres).all():
         raise UserError(f"{count} lines of x y z are needed, one for each camera", file=path)
     return centres
-
-
-def write_rig(stage: Stage, folder: Path, rig: WandRig) -> None:
-    """``NAME.cameramodel`` for each camera, then ``rig.json``, which names them all."""
-    cameras: dict[str, object] = {}
-    for c, (name, camera) in enumerate(zip(rig.names, rig.cameras, strict=True)):
-        path = folder / f"{name}.cameramodel"
-        with stage.output(path) as temporary:
-            camera.write(temporary)
-        cameras[name] = {
-            "file": path.name,
-            "world_from_camera": camera.world_from_camera.matrix(),
-            "covariance": rig.covariance[c],
-            "delay_frames": rig.delays[c],
-        }
-    with stage.output(folder / "rig.json") as temporary:
-        write_json(temporary, {"unit": rig.unit, "gauge": rig.gauge(), "cameras": cameras})
 
 
 def _table(path: Path) -> NDArray[np.float64]:

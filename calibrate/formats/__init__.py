@@ -14,6 +14,7 @@ from chromeball.calibrate.formats.table import (
     prepared,
     read_camera,
     read_cameras,
+    read_lenses,
     write_cameras,
 )
 
@@ -28,5 +29,6 @@ __all__ = [
     "prepared",
     "read_camera",
     "read_cameras",
+    "read_lenses",
     "write_cameras",
 ]

@@ -8,10 +8,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from chromeball.calibrate.formats.named import Hints, NamedCamera, files_of
+from chromeball.calibrate.rig_file import read_rig
 from chromeball.scene.camera import CameraModel
 from chromeball.scene.errors import UserError
 from chromeball.scene.pose import Pose
-from chromeball.scene.record import read_json
 
 TITLE = "mrcal's camera model"
 SUFFIX = ".cameramodel"
@@ -39,28 +39,15 @@ def read(path: Path, hints: Hints) -> list[NamedCamera]:
 
 def _of_rig(cameras: Sequence[NamedCamera], file: Path) -> list[NamedCamera]:
     """`cameras` in the order of ``rig.json``, with its offsets in time and its unit."""
-    told = read_json(file)
-    listed = told.get("cameras") if isinstance(told, dict) else None
-    if isinstance(listed, dict):  # by `calibrate wand`
-        entries = {str(name): entry for name, entry in listed.items()}
-    elif isinstance(listed, list):
-        entries = {str(e.get("name")): e for e in listed if isinstance(e, dict)}
-    else:
-        raise UserError("it names no cameras", file=file)
+    rig = read_rig(file)
     there = {named.name: named for named in cameras}
-    missing = [name for name in entries if name not in there]
-    if missing:
+    if missing := [own.name for own in rig.cameras if own.name not in there]:
         raise UserError(f"there is no {missing[0]}{SUFFIX} beside it", file=file)
-    unit = told.get("unit", "m")
-    notes = () if unit == "m" else (f"places are in {str(unit)[:40]}, not in metres",)
-    found: list[NamedCamera] = []
-    for name, entry in entries.items():
-        offset = entry.get("time_offset") if isinstance(entry, dict) else None
-        if offset is not None and not isinstance(offset, int | float):
-            raise UserError(f"the time_offset of {name} is no number", file=file)
-        seconds = None if offset is None else float(offset)
-        found.append(replace(there[name], time_shift=seconds, rig=True, notes=notes))
-    return found
+    notes = () if rig.unit == "m" else (f"places are in {rig.unit[:40]}, not in metres",)
+    return [
+        replace(there[own.name], time_shift=own.time_offset, rig=True, notes=notes)
+        for own in rig.cameras
+    ]
 
 
 def encode(cameras: Sequence[NamedCamera], path: Path) -> dict[str, bytes]:

@@ -59,14 +59,35 @@ def read_camera(path: str | os.PathLike[str]) -> CameraModel:
             "one out with `chromeball calibrate convert ... --camera NAME -o NAME.cameramodel`",
             file=path,
         )
-    cost = found[0].loss
+    return _own_lens(found[0], file)
+
+
+def read_lenses(path: str | os.PathLike[str]) -> dict[str, CameraModel]:
+    """The cameras of a file or folder of any format, by name; a single one by its file's.
+
+    Raises
+    ------
+    UserError
+        There is none in it, or one whose lens is none of ours.
+
+    """
+    file = Path(path)
+    found = read_cameras([file])
+    if len(found) == 1:
+        return {file.stem: _own_lens(found[0], file)}
+    return {named.name: _own_lens(named, file) for named in found}
+
+
+def _own_lens(named: NamedCamera, path: Path) -> CameraModel:
+    """The camera, if its lens was not changed in reading it."""
+    cost = named.loss
     if cost is not None and cost.worst > _UNTOLD:
         raise UserError(
             f"its {cost.was} lens is none of ours, {cost.now} comes within {cost.rms:.2g} px "
             "of it: if that will do, take it from `chromeball calibrate convert`",
             file=path,
         )
-    return found[0].camera
+    return named.camera
 
 
 def read_cameras(

@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from chromeball.calibrate import detect_cache
 from chromeball.calibrate.detect import (
     detect,
-    detect_files,
     grey,
     judge,
     larger_board,
     look,
 )
+from chromeball.calibrate.search import detect_files
 from chromeball.calibrate.target import Charuco, Chessboard, Target, parse_target
 from chromeball.calibrate.virtual import board_poses, photograph, project
 from chromeball.scene.camera import CameraModel

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from chromeball.calibrate.adjust import Estimate, adjust, covariance, gradients
 from chromeball.calibrate.choose import choose_model, held_out_errors, pose_errors
-from chromeball.calibrate.detect import detect_files
 from chromeball.calibrate.lens import calibrate_lens
+from chromeball.calibrate.search import detect_files
 from chromeball.calibrate.target import Chessboard
 from chromeball.calibrate.uncertainty import camera_uncertainty, worst_direction
 from chromeball.calibrate.virtual import board_poses, project, surrounding_poses

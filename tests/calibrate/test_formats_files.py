@@ -17,8 +17,10 @@ from chromeball.calibrate.formats import (
     NamedCamera,
     read_camera,
     read_cameras,
+    read_lenses,
     write_cameras,
 )
+from chromeball.calibrate.rig_file import Rig, RigCamera, write_rig
 from chromeball.cli.main import build_app
 from chromeball.scene.camera import CameraModel
 from chromeball.scene.errors import UserError
@@ -179,8 +181,9 @@ def test_a_rig_folder_keeps_order_and_times(tmp_path: Path) -> None:
     for name in "ab":
         LENS.write(tmp_path / f"{name}.cameramodel")
     rig = tmp_path / "rig.json"
-    entries = [{"name": "b", "time_offset": None}, {"name": "a", "time_offset": -0.02}]
-    rig.write_text(json.dumps({"cameras": entries}))
+    b = RigCamera("b", LENS, np.zeros((6, 6)), 0.1, 0.1, None, None, None, None)
+    a = replace(b, name="a", time_offset=-0.02)
+    write_rig(rig, Rig((b, a), "b counts as exact"))
     for source in (tmp_path, rig):
         found = read_cameras([source])
         assert [(c.name, c.time_shift, c.rig) for c in found] == [
@@ -190,10 +193,13 @@ def test_a_rig_folder_keeps_order_and_times(tmp_path: Path) -> None:
     cost = write_cameras(tmp_path / "c.yaml", found, "kalibr")
     assert [c.time_shift for c in read_cameras([tmp_path / "c.yaml"])] == [None, -0.02]
     assert len(cost.left_behind) == 1  # the place of the first
-    rig.write_text(json.dumps({"unit": "feet", "cameras": {"b": {}, "a": {}}}))
+    write_rig(rig, Rig((b, a), "b counts as exact", unit="feet"))
     cost = write_cameras(tmp_path / "c.usda", read_cameras([tmp_path]))
     assert "b: places are in feet, not in metres" in cost.notes
-    rig.write_text(json.dumps({"cameras": {"c": {}}}))
+    assert set(read_lenses(tmp_path)) == {"a", "b"}
+    assert set(read_lenses(tmp_path / "a.cameramodel")) == {"a"}
+    assert len(read_lenses(tmp_path / "c.yaml")) == 2
+    write_rig(rig, Rig((b, replace(b, name="c")), "b counts as exact"))
     with pytest.raises(UserError, match="there is no c"):
         read_cameras([tmp_path])
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from chromeball.calibrate.led import LightTrack, together, track_lights
 from chromeball.calibrate.led_fit import fit_spot
+from chromeball.calibrate.rig_file import read_rig
 from chromeball.calibrate.virtual_wand import film, path, room
 from chromeball.cli.main import build_app
 from chromeball.scene.camera import CameraModel
@@ -156,10 +157,10 @@ def test_command(
     assert figures["unit"] == "m"
     assert figures["sigma"] < 0.15
     assert figures["tracks"]["cam0"]["frames"] == FRAMES
-    value = read_json(output / "rig.json")
+    rig = read_rig(output / "rig.json")
     truth = cameras[0].world_from_camera.inverse()
     for c in (1, 2):
-        there = np.array(value["cameras"][f"cam{c}"]["world_from_camera"])[:3, 3]
+        there = rig[f"cam{c}"].camera.world_from_camera.translation
         expected = (truth @ cameras[c].world_from_camera).translation
         assert np.linalg.norm(there - expected) < 0.006
     assert len(read_json(output / "rig.json.record.json")["inputs"]) == 6

@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from chromeball.calibrate.choose import choose_model, held_out_errors, pose_errors
-from chromeball.calibrate.detect import detect_files
 from chromeball.calibrate.lens import calibrate_lens
+from chromeball.calibrate.search import detect_files
 from chromeball.calibrate.target import Chessboard
 from chromeball.calibrate.virtual import board_poses, project
 from chromeball.scene.camera import CameraModel

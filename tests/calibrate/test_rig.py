@@ -201,6 +201,32 @@ def test_wrong_pairs_and_mirrors_are_no_rig() -> None:
         solve(mirrored, models=["opencv4"] * 3)
 
 
+def test_copies_shifts_and_moves_are_refused() -> None:
+    """A folder twice, one numbered otherwise, a camera that was knocked between pictures."""
+    corners = observe(BOARD, CAMERAS, POSES, seed=1)
+    with pytest.raises(UserError, match="cameras b and d have the same pictures"):
+        solve(corners[[0, 1, 2, 1]])
+    shifted = corners.copy()
+    shifted[1] = np.roll(corners[1], 1, axis=0)
+    with pytest.raises(UserError, match=r"camera b: \d of its 12 boards do not fit the other"):
+        solve(shifted)
+    stood = CAMERAS[1].world_from_camera
+    turn = Pose.from_rotation_vector([0, 0.02, 0.01], np.zeros(3)).rotation
+    for pose in (
+        Pose(stood.rotation @ turn, stood.translation),
+        Pose(stood.rotation, stood.translation + [0.03, 0, 0.015]),
+    ):
+        after = observe(
+            BOARD, [CAMERAS[0], CAMERAS[1].posed(pose), *CAMERAS[2:]], POSES, seed=1
+        )
+        mixed = corners.copy()
+        mixed[1, 11:] = after[1, 11:]
+        with pytest.raises(
+            UserError, match=r"camera b was moved, .* between pictures 10 and 13"
+        ):
+            solve(mixed)
+
+
 def test_too_few_boards_name_the_camera() -> None:
     corners = observe(BOARD, CAMERAS, POSES, seed=6)
     seen = np.flatnonzero(np.isfinite(corners[1, ..., 0]).any(axis=(1, 2)))

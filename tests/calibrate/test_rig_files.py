@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from chromeball.calibrate.rig_file import read_rig, rig_of, write_rig
 from chromeball.calibrate.rig_result import RigSolution
-from chromeball.calibrate.rig_views import Plan, Source, find_sources, plan_pairs
+from chromeball.calibrate.rig_views import Plan, Source, find_sources, look, plan_pairs
 from chromeball.calibrate.target import Chessboard
 from chromeball.calibrate.virtual import photograph
 from chromeball.calibrate.virtual_rig import see, waved_board
@@ -125,9 +125,13 @@ def solution() -> RigSolution:
 
 def test_rig_json_reads_back(tmp_path: Path) -> None:
     path = tmp_path / "rig.json"
-    write_rig(path, solution())
-    rig, written = read_rig(path), rig_of(solution())
+    written = rig_of(solution())
+    write_rig(path, written)
+    rig = read_rig(path)
+    assert rig.covariance is not None
+    assert written.covariance is not None
     np.testing.assert_array_equal(rig.covariance, written.covariance)
+    assert (rig.unit, rig.gauge, rig.pairs) == ("m", written.gauge, (("left", "right", 3),))
     for a, b in zip(rig.cameras, written.cameras, strict=True):
         assert (a.name, a.rms, a.sigma, a.time_offset) == (b.name, b.rms, b.sigma, None)
         np.testing.assert_array_equal(a.camera.intrinsics, b.camera.intrinsics)
@@ -142,6 +146,9 @@ def test_rig_json_reads_back(tmp_path: Path) -> None:
         rig["top"]
     told = json.loads(path.read_text())
     assert told["pairs"] == [{"cameras": ["left", "right"], "boards": 3}]
+    path.write_text(json.dumps(told | {"covariance": None}))
+    with pytest.raises(UserError, match="not known: the pose of left counts as exact"):
+        read_rig(path).distance("left", "right")
     told["covariance"].pop()
     path.write_text(json.dumps(told))
     with pytest.raises(UserError, match="not 12 x 12"):
@@ -156,6 +163,40 @@ def test_no_rig_is_no_rig(tmp_path_factory: pytest.TempPathFactory, content: byt
     path.write_bytes(content)
     with pytest.raises(UserError):
         read_rig(path)
+
+
+def test_videos_are_searched_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Frames in two processes as in one; from the cache without decoding; a short video."""
+    camera = CameraModel("pinhole", np.array([380.0, 380, 160, 120]), (320, 240))
+    videos: list[Source] = []
+    for name in ("left", "right"):
+        file = tmp_path / f"{name}.avi"
+        writer = cv2.VideoWriter(str(file), cv2.VideoWriter.fourcc(*"MJPG"), 25, (320, 240))
+        for i in range(6):
+            place = Pose.from_rotation_vector([0.02 * i, 0.1, 0], [-0.12, -0.1, 0.5])
+            picture = photograph(BOARD, camera, place, seed=10 * len(videos) + i)
+            writer.write(cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR))
+        writer.release()
+        videos.append(Source(name, (), file))
+    plan = plan_pairs(videos, every=2)
+    alone = look(videos, plan, BOARD)
+    assert np.isfinite(alone.corners).all()
+    cache, heard = tmp_path / "cache", list[str]()
+    cache.mkdir()
+    both = look(videos, plan, BOARD, workers=2, cache=cache, progress=heard.append)
+    np.testing.assert_array_equal(both.corners, alone.corners)
+    assert len(list(cache.iterdir())) == len(heard) == 6
+    assert heard[4].startswith("right 2: 30 of 30 corners")
+
+    def never(*_: object) -> None:
+        raise AssertionError("searched again")
+
+    monkeypatch.setattr("chromeball.calibrate.search.judge", never)
+    again = look(videos, plan, BOARD, cache=cache)
+    np.testing.assert_array_equal(again.corners, alone.corners)
+    beyond = Plan(np.array([[0, 9], [0, -1]]), None, ("0", "9"))
+    with pytest.raises(UserError, match="the video ends at frame 6, before its time"):
+        look(videos, beyond, BOARD, cache=cache)
 
 
 def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

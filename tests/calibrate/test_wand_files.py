@@ -11,6 +11,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from chromeball.calibrate.rig_file import read_rig
 from chromeball.calibrate.virtual_wand import path, room, watch
 from chromeball.calibrate.wand_files import read_centres, read_lens, read_points
 from chromeball.calibrate.wand_result import Tracks
@@ -110,12 +111,13 @@ def test_command(
     out = capsys.readouterr().out
     assert "3 cameras, RMS" in out
     assert "lengths in metres" in out
-    value = read_json(output / "rig.json")
-    assert value["unit"] == "m"
+    rig = read_rig(output / "rig.json")
+    assert rig.unit == "m"
     for name, camera in zip(("cam0", "cam1", "cam2"), cameras, strict=True):
-        found = CameraModel.read(output / value["cameras"][name]["file"])
-        there = found.world_from_camera
-        np.testing.assert_allclose(there.matrix(), value["cameras"][name]["world_from_camera"])
+        there = CameraModel.read(output / f"{name}.cameramodel").world_from_camera
+        told = rig[name].camera.world_from_camera
+        np.testing.assert_allclose(there.matrix(), told.matrix(), atol=1e-14)
+        assert rig[name].covariance.shape == (6, 6)
         np.testing.assert_allclose(
             there.translation, camera.world_from_camera.translation, atol=3e-3
         )

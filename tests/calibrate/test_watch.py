@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from chromeball.calibrate.detect import detect_files
+from chromeball.calibrate.search import detect_files
 from chromeball.calibrate.target import Charuco
 from chromeball.calibrate.virtual import board_poses, photograph
 from chromeball.calibrate.watch import Progress, watch_lens

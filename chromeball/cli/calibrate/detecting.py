@@ -10,9 +10,10 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import Progress
 
-from chromeball.calibrate.detect import detect_files, larger_board
+from chromeball.calibrate.detect import larger_board
 from chromeball.calibrate.detect_cache import default_folder
 from chromeball.calibrate.detection import Detection
+from chromeball.calibrate.search import detect_files
 from chromeball.calibrate.target import Target
 from chromeball.cli.calibrate.arguments import say
 
@@ -32,15 +33,22 @@ def detect_told(images: Sequence[Path], target: Target, cache: bool) -> list[Det
             images,
             target,
             tell,
-            workers=os.process_cpu_count() or 1,
-            cache=_writable(default_folder()) if cache else None,
+            workers=cores(),
+            cache=kept_in() if cache else None,
         )
     if larger := larger_board([d.file for d in detections if d.usable], target):
         say(f"{larger}; the part that was named is used")
     return detections
 
 
-def _writable(folder: Path) -> Path | None:
+def cores() -> int:
+    """Processes that may run at once."""
+    return os.process_cpu_count() or 1
+
+
+def kept_in() -> Path | None:
+    """The folder that keeps detections; None, told, where it cannot be written."""
+    folder = default_folder()
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if os.access(folder, os.W_OK):

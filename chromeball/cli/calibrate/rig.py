@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from chromeball.cli.calibrate.arguments import Json, Out, print_figures, say
+from chromeball.cli.calibrate.arguments import Cache, Json, Out, print_figures, say, store_rig
 from chromeball.scene.errors import UserError
 from chromeball.scene.record import Stage, atomic_output
 
@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 #: Corners over less of the picture leave a lens to be completed.
 SEEN_ENOUGH = 0.6
+#: A camera that is so many times less exact in the rig than alone is told of.
+UNEVEN = 1.3
 
 
 def rig(
@@ -32,6 +34,7 @@ def rig(
     times: Path | None = None,
     every: int = 1,
     distance: str | None = None,
+    cache: Cache = True,
     json: Json = False,
 ) -> None:
     """Calibrate the cameras of a rig and where they stand, from pictures of one board.
@@ -53,7 +56,7 @@ def rig(
         The lens model of all cameras, as `calibrate lens` has it without splined, or NAME=MODEL
         of one; may be given several times. auto by default.
     lens
-        Known lenses, NAME.cameramodel; they are kept as they are.
+        Known lenses, NAME.cameramodel, or files that convert reads; they are kept as they are.
     refine
         Refine the known lenses, too.
     times
@@ -62,18 +65,21 @@ def rig(
         Use every second, third ... instant alone.
     distance
         A length to check the scale by, LEFT:RIGHT:METRES between two cameras.
+    cache
+        Keep detections, and do not search pictures or frames again that were searched before.
     json
         Print the figures as JSON.
 
     """
     from chromeball.calibrate.detect import larger_board
+    from chromeball.calibrate.formats import read_lenses
     from chromeball.calibrate.rig import calibrate_rig
-    from chromeball.calibrate.rig_file import rig_of, write_rig
+    from chromeball.calibrate.rig_file import rig_of
     from chromeball.calibrate.rig_lenses import MODELS
     from chromeball.calibrate.rig_plots import plot_layout, plot_residuals, plot_sync
     from chromeball.calibrate.rig_views import find_sources, look, plan_pairs
     from chromeball.calibrate.target import parse_target
-    from chromeball.scene.camera import CameraModel
+    from chromeball.cli.calibrate.detecting import cores, kept_in
 
     board = parse_target(target)
     if output.exists() and not output.is_dir():
@@ -83,7 +89,9 @@ def rig(
     models = _models(model or [], names, MODELS)
     ends = _ends(distance, names)
     lenses = list(lens or [])
-    known: dict[str, CameraModel] = {p.stem: CameraModel.read(p) for p in lenses}
+    known: dict[str, CameraModel] = {}
+    for path in lenses:
+        known |= read_lenses(path)
     if refine and not known:
         raise UserError("--refine is for lenses given by --lens")
     inputs = [*(p for source in sources for p in source.paths), *lenses]
@@ -97,10 +105,12 @@ def rig(
         files = [file for source in sources for file in source.files]
         if larger := larger_board(files, board):
             raise UserError(f"{larger}; the cameras must all see the same corners")
-        views = look(sources, plan, board, progress=say)
+        kept = kept_in() if cache else None
+        views = look(sources, plan, board, workers=cores(), cache=kept, progress=say)
         solution = calibrate_rig(
             views.corners, board, views.sizes, names,
-            models=models, known=known, refine=refine, stamps=plan.stamps, progress=say,
+            models=models, known=known, refine=refine, stamps=plan.stamps,
+            labels=plan.labels, progress=say,
         )  # fmt: skip
         stage.figures.update(_figures(solution, plan.labels))
         if ends is not None:
@@ -116,11 +126,7 @@ def rig(
             with atomic_output(output / f"{name}.png") as temporary:
                 plot(solution, temporary)
         stage.figures["plots"] = {name: f"{name}.png" for name in plots}
-        for name, camera in zip(names, solution.cameras, strict=True):
-            with stage.output(output / f"{name}.cameramodel") as temporary:
-                camera.write(temporary)
-        with stage.output(output / "rig.json") as temporary:
-            write_rig(temporary, solution)
+        store_rig(stage, output, rig_of(solution))
     for line in _advice(solution, plan.labels, plan.stamps is not None, stage.figures):
         say(line)
     if json:
@@ -214,7 +220,7 @@ def _advice(
     solution: RigSolution, labels: tuple[str, ...], timed: bool, figures: dict[str, Any]
 ) -> list[str]:
     """What a person should know or do."""
-    lines: list[str] = []
+    names, lines = solution.names, list[str]()
     if solution.repeated:
         shown = ", ".join(labels[v] for v in solution.repeated[:6])
         lines.append(f"pictures that repeat earlier ones count for nothing: {shown}")
@@ -234,6 +240,13 @@ def _advice(
             f"together the cameras are {solution.disagreement:.1f} times less exact than "
             f"alone; {why}"
         )
+    elif solution.sync is None:
+        lines += [
+            f"{name} is {ratio:.1f} times less exact in the rig than alone: was it or a "
+            "neighbour moved between pictures?"
+            for name, ratio in zip(names, solution.sigma / solution.alone, strict=True)
+            if ratio > UNEVEN
+        ]
     if "distance" in figures:
         told = figures["distance"]
         ratio = told["given"] / told["measured"]
@@ -261,8 +274,9 @@ def _open_lenses(solution: RigSolution, shares: dict[str, float]) -> list[str]:
             continue
         pixels, seen = seen_places(camera)
         where, _ = named(thirds(~seen, pixels, camera.size))
+        beyond = "all around" if where == "the whole picture" else f"in {where}"
         lines.append(
-            f"{name}: corners lie over {shares[name]:.0%} of its picture; beyond, in {where}, "
+            f"{name}: corners lie over {shares[name]:.0%} of its picture; beyond, {beyond}, "
             "its lens is a guess: show it the board there, or calibrate it by itself and give "
             "--lens"
         )

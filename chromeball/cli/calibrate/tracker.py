@@ -9,7 +9,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from chromeball.cli.calibrate.arguments import Json, Out, print_figures, say
+from chromeball.cli.calibrate.arguments import Cache, Json, Out, print_figures, say
 from chromeball.scene.errors import UserError
 from chromeball.scene.record import Stage, atomic_output
 
@@ -28,6 +28,7 @@ def tracker(
     rotation_noise: float | None = None,
     window: float | None = None,
     search: float = 0.5,
+    cache: Cache = True,
     json: Json = False,
 ) -> None:
     """Find how a tracker's sensor sits on a camera, where a board is, and the tracker's delay.
@@ -59,20 +60,21 @@ def tracker(
         The delay lies within so many seconds of zero.
     output
         The tracker.json to write.
+    cache
+        Keep detections, and do not search pictures again that were searched before.
     json
         Print the figures as JSON.
 
     """
     import numpy as np
 
-    from chromeball.calibrate.detect import detect_files
-    from chromeball.calibrate.detection import Detection
     from chromeball.calibrate.formats import read_camera
     from chromeball.calibrate.target import parse_target
     from chromeball.calibrate.tracker import solve_tracker
     from chromeball.calibrate.tracker_file import figures, write_tracker
     from chromeball.calibrate.tracker_log import read_log, read_times
     from chromeball.calibrate.tracker_plot import plot_differences
+    from chromeball.cli.calibrate.detecting import detect_told
 
     for name, value in (
         ("--position-noise", position_noise),
@@ -118,11 +120,7 @@ def tracker(
         "rotation_noise": rotation_noise, "window": window, "search": search,
     }  # fmt: skip
     with Stage("calibrate tracker", inputs, **options) as stage:
-
-        def tell(detection: Detection) -> None:
-            say(f"{detection.file}: {detection.verdict}")
-
-        detections = detect_files(images, board, tell)
+        detections = detect_told(images, board, cache)
         if detections[0].size != lens.size:
             raise UserError(
                 "it is for pictures of {}x{}, these are {}x{}".format(

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import App, Parameter
 
-from chromeball.cli.calibrate.arguments import Json, Out, say
+from chromeball.cli.calibrate.arguments import Cache, Json, Out, say
 from chromeball.cli.calibrate.vignette_overlap import figures_of, overlap, told
 from chromeball.cli.options import Numbers
 from chromeball.scene.errors import UserError
@@ -39,6 +39,7 @@ def board(
     response: Path | None = None,
     smooth: bool | None = None,
     output: Out,
+    cache: Cache = True,
     json: Json = False,
 ) -> None:
     """Measure it on the white paper of a board, with the pictures of a lens calibration.
@@ -60,15 +61,16 @@ def board(
         Add a smooth map to the polynomial, or forbid it; by default where the pictures ask.
     output
         The vignette.json to write.
+    cache
+        Keep detections, and do not search pictures again that were searched before.
     json
         Print the figures as JSON.
 
     """
-    from chromeball.calibrate.detect import detect_files
-    from chromeball.calibrate.detection import Detection
     from chromeball.calibrate.target import parse_target
     from chromeball.calibrate.vignette import solve
     from chromeball.calibrate.vignette_board import board_samples, check_target
+    from chromeball.cli.calibrate.detecting import detect_told
 
     sheet = parse_target(target)
     check_target(sheet)
@@ -77,10 +79,7 @@ def board(
     with Stage("calibrate vignette board", [*images, *others], target=target) as stage:
         aperture = _aperture(images)
 
-        def tell(detection: Detection) -> None:
-            say(f"{detection.file}: {detection.verdict}")
-
-        used = [d for d in detect_files(images, sheet, tell) if d.usable]
+        used = [d for d in detect_told(images, sheet, cache) if d.usable]
         if len(used) < 4:
             raise UserError(
                 f"the board was seen in {len(used)} pictures; its light and the lens's "

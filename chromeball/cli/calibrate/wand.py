@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from chromeball.cli.calibrate.arguments import Json, Out, print_figures, say
+from chromeball.cli.calibrate.arguments import Json, Out, print_figures, say, store_rig
 from chromeball.scene.errors import UserError
 from chromeball.scene.record import Stage, atomic_output, check_output
 
@@ -80,8 +80,9 @@ def wand(
         Print the figures as JSON.
 
     """
+    from chromeball.calibrate.rig_file import rig_of_wand
     from chromeball.calibrate.wand import solve_wand
-    from chromeball.calibrate.wand_files import read_centres, read_points, write_rig
+    from chromeball.calibrate.wand_files import read_centres, read_points
     from chromeball.calibrate.wand_plot import plot_wand
     from chromeball.calibrate.wand_world import as_surveyed
 
@@ -132,7 +133,7 @@ def wand(
         with atomic_output(output / "rig.png") as temporary:
             plot_wand(rig, temporary)
         stage.figures["plots"] = {"rig": "rig.png"}
-        write_rig(stage, output, rig)
+        store_rig(stage, output, rig_of_wand(rig, rate))
     for line in _advice(rig, survey):
         say(line)
     if json:
